@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.optimize import nnls
 
+from ..exceptions import some_of
 from ..inputs import column_contract
 from ..runtime.trees.facts import YEARS, number, text
 from .errors.header_pointing import HeaderPointing
@@ -24,6 +25,7 @@ MOVING = 6.6
 #: Fits of a law of errors one after the other, each with the weights of that before.
 _ROUNDS = 20
 
+_MOST_NAMED = 6
 _COUNT, _SCALE, _PIXELS = number(minimum=0), number(minimum=0), number(minimum=0, unit="pix")
 
 
@@ -309,7 +311,7 @@ class FittedTerm:
     ----------
     name, unit : str
         Of the term, and of its numbers.
-    owner : {"set", "exposure", "detector"}
+    owner : {"set", "exposure", "detector", "star"}
     size : float
         Scatter of the numbers about zero, found or as it was given; 0: the positions do not show the term.
     gain : float
@@ -318,6 +320,8 @@ class FittedTerm:
         Whether the size was found.
     rms : float
         Of the displacements, pixels per axis.
+    n_asked : int
+        Owners that might have it.
     owners, numbers : tuple of str
         Exposure or detector, and name, of every number.
     values, errors : tuple of float
@@ -326,11 +330,12 @@ class FittedTerm:
 
     name: str
     unit: str
-    owner: str = field(metadata=text("set", "exposure", "detector"))
+    owner: str = field(metadata=text("set", "exposure", "detector", "star"))
     size: float = field(metadata=_SCALE)
     gain: float
     found: bool
     rms: float = field(metadata=_PIXELS)
+    n_asked: int = field(metadata=_COUNT)
     owners: tuple[str, ...]
     numbers: tuple[str, ...]
     values: tuple[float, ...]
@@ -340,12 +345,15 @@ class FittedTerm:
         seen = f"twice the gain in log-likelihood {self.gain:.3g}"
         if not self.size:
             return f"{self.name}: the positions do not show it, it is left away"
-        n = len(self.values)
+        n, owners = len(self.values), list(dict.fromkeys(self.owners))
         if n == 1:
             what = f"{self.values[0]:.4g} +- {self.errors[0]:.2g} {self.unit} {self.numbers[0]}"
+        elif len(owners) < self.n_asked:
+            named = some_of(owners, _MOST_NAMED)
+            what = f"{len(owners)} of {self.n_asked} {self.owner}s ({named}), {self.size:.2g} {self.unit}"
         else:
-            each = {"set": "", "exposure": ", of every exposure its own", "detector": ", of every detector its own"}
-            what = f"{n} numbers{each[self.owner] if len(set(self.owners)) > 1 else ''}, {self.size:.2g} {self.unit}"
+            each = f", of every {self.owner} its own" if len(owners) > 1 else ""
+            what = f"{n} numbers{each}, {self.size:.2g} {self.unit}"
         return f"{self.name}: {what}; it displaces positions by {self.rms:.2g} px rms per axis ({seen})"
 
 

@@ -90,8 +90,15 @@ def terms(solution):
 def stars_at(solution, time):
     """`Solution.stars_at`; see there."""
     estimate, sky, at = solution.estimate, solution.sky, year(time)
-    xy = estimate.positions + star_motions.fitted(estimate.motions).displacement(at, sky)
+    bent, responses = star_motions.curved(solution, at)
+    xy = estimate.positions + star_motions.fitted(estimate.motions).displacement(at, sky) + bent
     moved = [estimate.motions.carried(each, at, sky) for each in _unknowns(solution)]
+    if responses.any():  # errors of a path go with those of position and motion
+        rows = np.hstack([np.eye(2), estimate.motions.columns([at], sky)[0]])
+        straight = rows @ estimate.uncertainty.camera.of_stars(rows.shape[1]).transpose(1, 0, 2)
+        whole = straight + responses
+        more = absolute_errors.variances(whole @ whole.mT - straight @ straight.mT)
+        moved = [each + more for each in moved]
     moved[1][:, np.isnan(_absolute(solution, False)[0])] = np.nan
     table = _places(solution, xy, err=moved[0], err_abs=moved[1])
     if sky is not None:

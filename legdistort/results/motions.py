@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy import units as u
+from numpy.polynomial import legendre
 
 from ..exceptions import InputError
 from ..geometry import parallax
+from ..geometry.epochs import ONE_EPOCH
 from ..inputs.column_contract import correlation
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees.facts import YEARS, array, text
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
 
     from ..geometry.tangent_plane import TangentPlane
 
+#: Degrees of the polynomials of time that follow an orbit, once round it, to a thousandth of its size.
+_ORBIT = range(2, 9)
 #: Units of the terms of stars in the reference plane and on the sky, and their names there.
 UNITS = {"vx": u.pix / u.yr, "vy": u.pix / u.yr, "parallax": u.pix}
 
@@ -53,6 +57,11 @@ class StarMotions(ShownAsPrinted):
     chi2: np.ndarray = field(metadata=array("n_stars", minimum=0))
     n_epochs: np.ndarray = field(metadata=array("n_stars", holds="integers", minimum=0))
     span: np.ndarray = field(metadata=array("n_stars", unit="yr", minimum=0))
+
+    @property
+    def longest(self) -> float:
+        """Between the epoch and an exposure, years, at least a day."""
+        return max(float(np.abs(self.years - self.epoch).max()), ONE_EPOCH)
 
     @property
     def kind(self) -> str:
@@ -93,6 +102,50 @@ class StarMotions(ShownAsPrinted):
         if twice:
             words += f"; {twice} seen at two epochs only, so that no observation checks the motion{'s' * (twice > 1)}"
         return words
+
+
+def accelerated(time, _span):
+    """Paths (1, n) of unit acceleration at times (n,) since the epoch."""
+    return 0.5 * np.asarray(time)[None] ** 2
+
+
+def smooth_paths(time, span):
+    """Paths (7, n) beyond a straight motion at times (n,) since the epoch, for exposures up to `span` from it.
+
+    Legendre polynomials without what they are at the epoch, in place and rate: position and motion are those then.
+    """
+    u, out = np.asarray(time) / span, []
+    for degree in _ORBIT:
+        series = legendre.Legendre.basis(degree)
+        out.append(series(u) - series(0.0) - series.deriv()(0.0) * u)
+    return np.stack(out)
+
+
+#: Names of the numbers of a path, along x and along y, and the paths, of terms of which stars are the owners.
+PATHS = {
+    "acceleration": (("ax", "ay"), accelerated),
+    "orbits": (tuple(f"{axis} {degree}" for degree in _ORBIT for axis in "xy"), smooth_paths),
+}
+
+
+def curved(solution, time):
+    """What terms that bend the paths of stars add at a time: displacements (n_stars, 2), their responses (.., 2, r)."""
+    estimate, found = solution.estimate, solution.diagnostics.terms
+    errors, motions = estimate.uncertainty.camera, estimate.motions
+    size = 0 if errors is None else errors.changes.shape[1]
+    moved, responses = np.zeros((len(estimate.star_names), 2)), np.zeros((len(estimate.star_names), 2, size))
+    number, index = 0, {str(name): j for j, name in enumerate(estimate.star_names)}
+    for each in found:
+        if each.name in PATHS:
+            names, paths = PATHS[each.name]
+            path = paths(np.array([time - motions.epoch]), motions.longest)[:, 0]
+            for k, (owner, name, value) in enumerate(zip(each.owners, each.numbers, each.values, strict=True)):
+                n = names.index(name)
+                moved[index[owner], n % 2] += path[n // 2] * value
+                if errors is not None and errors.numbers is not None:
+                    responses[index[owner], n % 2] += path[n // 2] * errors.numbers[number + k]
+        number += len(each.values)
+    return moved, responses
 
 
 def fitted(motions):

@@ -376,7 +376,7 @@ def camera_step(fit, sought, departure):
     change[free] = held @ (departure[free] + covariance @ pull) - departure[free]
     covariance = held @ covariance @ held.T
     freedom = float(np.sum(covariance * follow.normal))
-    return CameraStep(change, covariance, free, follow.stars, follow.coefficients, freedom, weak)
+    return CameraStep(change, covariance, free, follow.stars[:2], follow.coefficients, freedom, weak)
 
 
 def _patterns(matches, camera, problem, free):

@@ -523,12 +523,13 @@ def _held_back(fit, problem):
         return {}
     own = unpacked(fit.blocks.v)
     follow = own @ np.linalg.pinv(own + unpacked(problem.terms.catalogue.precision), hermitian=True)
-    follow = follow.transpose(0, 2, 1)[:, :2, :2]
-    out = {}
+    follow, out = follow.transpose(0, 2, 1), {}
+    if camera is not None:
+        rows = camera.stars.shape[1]
+        out["camera_errors"] = replace(camera, stars=follow[:, :rows, :rows] @ camera.stars)
+    follow = follow[:, :2, :2]
     if shared is not None:
         out["shared_errors"] = variances(follow @ unpacked(shared) @ follow.transpose(0, 2, 1))
-    if camera is not None:
-        out["camera_errors"] = replace(camera, stars=follow @ camera.stars)
     return out
 
 

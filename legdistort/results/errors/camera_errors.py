@@ -55,8 +55,8 @@ class CameraErrors:
         Modes that were fitted.
     changes : ndarray, shape (k, r)
         Of these modes, pixels.
-    stars : ndarray, shape (n_stars, 2, r)
-        Of the positions, pixels of the reference plane.
+    stars : ndarray, shape (n_stars, 2, r) or (n_stars, 2 + k, r)
+        Of the positions, pixels of the reference plane, and perhaps of what moves stars.
     coefficients : ndarray, shape (n_exposures, 2 n_modes, r)
         Of the fitted coefficients, pixels.
     unknown : ndarray, shape (n_stars, 2, m)
@@ -66,17 +66,20 @@ class CameraErrors:
     owner : ndarray of int, shape (n_exposures,), or None
         Detector of every exposure, where each is of one alone and the modes are those of the exposure; None for those
         of the detectors of a camera.
+    numbers : ndarray, shape (m, r), or None
+        Of the numbers of terms, in the order of `Diagnostics.terms`.
     """
 
     free: np.ndarray = field(metadata=array("n_parts", 2, "modes", holds="booleans"))
     changes: np.ndarray = field(metadata=array("k", "r", unit="pix"))
-    stars: np.ndarray = field(metadata=array("n_stars", 2, "r", unit="pix"))
+    stars: np.ndarray = field(metadata=array("n_stars", "n_star_rows", "r", unit="pix"))
     coefficients: np.ndarray = field(metadata=array("n_exposures", "2 n_modes", "r", unit="pix"))
     unknown: np.ndarray = field(
         default_factory=lambda: np.zeros((0, 2, 0)), metadata=array("n_stars", 2, "m", blocks=(0, 2, 0))
     )
     departure: Departure | None = None
     owner: np.ndarray | None = field(default=None, metadata=array("n_exposures", holds="integers"))
+    numbers: np.ndarray | None = field(default=None, metadata=array("n_numbers", "r"))
 
     @classmethod
     def nothing(cls, n_parts: int, n_exposures: int, n_stars: int, size: int) -> CameraErrors:
@@ -84,24 +87,23 @@ class CameraErrors:
         free = np.zeros((n_parts, 2, 1), dtype=bool)
         return cls(free, np.zeros((0, 0)), np.zeros((n_stars, 2, 0)), np.zeros((n_exposures, size, 0)))
 
-    def beside(self, stars: np.ndarray, coefficients: np.ndarray) -> CameraErrors:
-        """With other independent errors of unit size, to which stars (n_stars, 2, r) and coefficients respond."""
+    def beside(self, stars: np.ndarray, coefficients: np.ndarray, numbers: np.ndarray) -> CameraErrors:
+        """With other independent errors of unit size, to which stars, coefficients and numbers of terms respond."""
         changes = np.pad(self.changes, ((0, 0), (0, stars.shape[2])))
-        stars = np.concatenate([self.stars, stars], axis=2)
-        return replace(
-            self, changes=changes, stars=stars, coefficients=np.concatenate([self.coefficients, coefficients], axis=2)
-        )
+        known = np.pad(self.stars, ((0, 0), (0, stars.shape[1] - self.stars.shape[1]), (0, 0)))
+        coefficients = np.concatenate([self.coefficients, coefficients], axis=2)
+        stars, numbers = np.concatenate([known, stars], axis=2), np.pad(numbers, ((0, 0), (self.changes.shape[1], 0)))
+        return replace(self, changes=changes, stars=stars, coefficients=coefficients, numbers=numbers)
 
     def scaled(self, factor: float) -> CameraErrors:
         """The same with all errors times a factor."""
-        names = "changes", "stars", "coefficients"
+        names = ["changes", "stars", "coefficients"] + ["numbers"] * (self.numbers is not None)
         return replace(self, **{name: factor * getattr(self, name) for name in names})
 
-    @property
-    def of_stars(self) -> np.ndarray:
-        """Covariance xx, yy, xy (3, n_stars) of the positions, px^2."""
-        x, y = self.stars[:, 0], self.stars[:, 1]
-        return np.stack([np.sum(x * x, axis=1), np.sum(y * y, axis=1), np.sum(x * y, axis=1)])
+    def of_stars(self, size: int) -> np.ndarray:
+        """Responses (size, n_stars, r) of the first unknowns of the stars; zero where there are none."""
+        rows = self.stars[:, :size].transpose(1, 0, 2)
+        return np.pad(rows, ((0, size - len(rows)), (0, 0), (0, 0)))
 
     def of_coefficients(self, i: int) -> np.ndarray:
         """Covariance (2 n_modes, 2 n_modes) of the coefficients of exposure i, px^2."""

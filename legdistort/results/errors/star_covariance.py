@@ -42,7 +42,7 @@ def star_matrix(solution):
     index = np.arange(2 * n).reshape(2, n).T
     out[index[:, :, None], index[:, None, :]] += inverse
     if camera := uncertainty.camera:
-        common = camera.stars.transpose(1, 0, 2).reshape(2 * n, -1)
+        common = camera.of_stars(2).reshape(2 * n, -1)
         out += common @ common.T
     variance, stored = np.diag(out).reshape(2, n), uncertainty.stars[:2]
     if not np.allclose(variance, stored, rtol=_ROUNDING, atol=0, equal_nan=True):

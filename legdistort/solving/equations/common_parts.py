@@ -14,8 +14,8 @@ class Followed:
 
     Attributes
     ----------
-    stars : ndarray, shape (2, n_stars, k)
-        How positions follow a unit of each.
+    stars : ndarray, shape (2 + m, n_stars, k)
+        How positions, and what moves stars, follow a unit of each.
     coefficients : ndarray, shape (n_exposures, 2 n_modes, k)
         How the fitted coefficients follow.
     normal : ndarray, shape (k, k)
@@ -48,13 +48,13 @@ def followed(respond, problem, blocks, patterns):
     moved, k = _weighted(problem, patterns), patterns.shape[2]
     normal = np.einsum("ank,anl->kl", patterns, moved)
     alone = np.diag(normal).copy()
-    stars = np.empty((2, problem.n_stars, k))
+    stars = np.empty((*blocks.g_star.shape, k))
     coefficients = np.empty((*blocks.g_exposure.shape, k))
     gradients = [_gradient(problem, blocks, patterns[:, :, j], moved[:, :, j]) for j in range(k)]
     whole = np.array([np.concatenate([each.ravel() for each in pair]) for pair in gradients]).reshape(k, -1)
     for j, pair in enumerate(gradients):
         star_response, response = respond(*pair)
-        stars[:, :, j], coefficients[:, :, j] = star_response[:2], response
+        stars[:, :, j], coefficients[:, :, j] = star_response, response
         normal[:, j] -= whole @ np.concatenate([response.ravel(), star_response.ravel()])
     pull = -np.einsum("ank,an->k", moved, blocks.residual)
     return Followed(stars, coefficients, (normal + normal.T) / 2, alone, pull)
@@ -77,14 +77,14 @@ def response(system, gauge):
 
 
 def relative_responses(follow, changes, result, uncertainty, degree):
-    """Stars (n_stars, 2, r) and coefficients (n_exposures, 2 n_modes, r) that follow changes (k, r), as a `Followed`.
+    """Stars (n_stars, 2 + m, r) and coefficients (n_exposures, 2 n_modes, r) by changes (k, r), as a `Followed` has it.
 
     Relative to a common map of the plane, which is taken off the stars and given to the coefficients.
     """
     gauge, stars = result.gauge, (follow.stars @ changes).transpose(1, 0, 2)
-    maps = plain_maps(gauge, result.state.positions.T, gauge.n_modes)[:, :2]
-    common = fitted(maps, uncertainty.star_weights[:, :2, :2], stars)
-    coefficients = follow.coefficients @ changes + widened_all(gauge.motion, degree) @ common
+    maps = plain_maps(gauge, result.state.positions.T, gauge.n_modes)
+    common = fitted(maps, uncertainty.star_weights, stars)
+    coefficients = follow.coefficients @ changes + widened_all(gauge.all_motion, degree) @ common
     return stars - maps @ common, coefficients
 
 

@@ -147,7 +147,7 @@ class Uncertainty:
     @cached_property
     def stars(self) -> np.ndarray:
         """Covariance xx, yy, xy of every star's position in the gauge, shape (3, n_stars), px^2."""
-        return self.star_unknowns[:3] + self._shared + (0.0 if self.camera is None else self.camera.of_stars)
+        return self.star_unknowns[:3] + self._shared
 
     @cached_property
     def star_unknowns(self) -> np.ndarray:
@@ -169,10 +169,10 @@ class Uncertainty:
                 inner /= self._scale**2
             whole = np.einsum("apj,pqj,bqj->abj", roots, inner, roots, optimize=True)
             whole += unpacked(inverse).transpose(1, 2, 0)
+        common = np.zeros((n_star, 1, 1)) if self.camera is None else self.camera.of_stars(n_star)
         for a in range(n_star):
             for b in range(a + 1):
-                out[index[a, b]] = whole[b, a]
-        out = self._scale**2 * out
+                out[index[a, b]] = self._scale**2 * whole[b, a] + np.sum(common[a] * common[b], axis=1)
         for row, diagonal in zip(index, np.diag(index), strict=True):
             lost = np.flatnonzero(inverse[diagonal] <= 0)
             out[row[:, None], lost] = np.nan
@@ -349,8 +349,8 @@ class Uncertainty:
             inverse, spread = self._spread(stars, size)
             out, own = spread @ times(self.coefficients, spread.T), self._scale**2 * inverse[:, :, :size] + shared
         if self.camera is not None:
-            common = self.camera.stars[stars].transpose(1, 0, 2).reshape(2 * n, -1)
-            out[: 2 * n, : 2 * n] += common @ common.T
+            common = self.camera.of_stars(size)[:, stars].reshape(size * n, -1)
+            out += common @ common.T
         index = np.arange(size * n).reshape(size, n).T
         out[index[:, :, None], index[:, None, :]] += own
         return out

@@ -3,6 +3,8 @@
 import numpy as np
 from astropy import units as u
 
+from ...results.motions import accelerated, smooth_paths
+
 #: Waves of the fraction of a pixel.
 _WAVES = 1, 2
 
@@ -30,3 +32,19 @@ def refraction(observed):
         to_sky = observed.sky.matrix[:, :2] / np.sqrt(abs(np.linalg.det(observed.sky.matrix[:, :2])))
         zenith = np.linalg.inv(to_sky) @ zenith
     return observed.on_detector(observed.values("tan_z") * observed.colour_departure * zenith)[None]
+
+
+def accelerations(observed):
+    """Half the square of the time since the epoch, along x and along y of the reference plane: (2, 2, n)."""
+    return _along_both(observed, accelerated(*observed.since_epoch))
+
+
+def orbits(observed):
+    """Smooth paths that leave the straight motion at the epoch, along x and y of the reference plane: (14, 2, n)."""
+    return _along_both(observed, smooth_paths(*observed.since_epoch))
+
+
+def _along_both(observed, paths):
+    """Paths (m, n) in time as displacements along x and along y, (2 m, 2, n)."""
+    along = np.eye(2)[:, :, None]
+    return np.stack([observed.on_detector(path * each) for path in paths for each in along])

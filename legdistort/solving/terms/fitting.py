@@ -6,43 +6,54 @@ each, G their gradients, C what the fit makes of a gradient. They are solved wit
 displacements are taken off the positions, and so on until nothing changes: the minimum over everything.
 
 The numbers of a term scatter about zero by a size that is held, or that of the largest restricted likelihood (stars and
-distortions integrated out): ``-2 ln L = ln |1 + s H s| - (s b)' (1 + s H s)^-1 (s b)`` for sizes s, b = H c + pull. A
-term of which the positions show nothing is left away.
+distortions integrated out): ``-2 ln L = ln |1 + s H s| - (s b)' (1 + s H s)^-1 (s b)`` for sizes s, b = H c + pull. One
+size after the other is taken where it is best, the others held (Tipping & Faul 2003), and what the positions do not
+show is left away: a term, or of a term whose owners have sizes of their own (few of many stars that move on orbits) an
+owner.
 """
 
+import contextlib
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
 from astropy import units as u
 from scipy import linalg
-from scipy.optimize import minimize
+from scipy.optimize import minimize_scalar
 
-from ...exceptions import ConvergenceWarning, SolveError, warn
+from ...exceptions import ConvergenceWarning, LegdistortError, SolveError, warn
 from ...matching.matches import DISPLACED
 from ...results.diagnostics import FittedTerm
 from ...results.errors.camera_errors import CameraErrors, unit_errors
 from ..equations.common_parts import followed, relative_responses, response
+from ..equations.elimination import inverse_star_blocks
+from ..equations.star_terms import unpacked
 from .observed import Observed
 
 #: Twice the gain in the logarithm of the likelihood from which a term is there.
 SHOWN = 4.0
 #: Fits at most, and the largest change of a number, in errors, at which they end.
 _FITS, _SMALL = 10, 0.02
+#: Chance that one of all owners with sizes of their own is called there that is not; sweeps over the sizes at most.
+_FALSE, _SWEEPS = 0.05, 300
+#: Part of that gain which an owner must show by itself to be looked at beside all others.
+_PERHAPS = 0.3
 #: Size that stands for an infinite one, in errors of a number if all others were known.
 _FREE = 1e4
 #: Numbers of all terms together, at most, and values of their displacements.
 _MOST, _VALUES = 3000, 100_000_000
 
 
-def fit_with(terms, estimate, matches, *how):
+def fit_with(terms, estimate, matches, options, *how):
     """What `estimate` gives, with the terms found beside.
 
     Parameters
     ----------
     terms : sequence of Term
     estimate : callable
-        ``estimate(matches, *how)`` gives a `Fit` and what else there is.
+        ``estimate(matches, options, *how)`` gives a `Fit` and what else there is.
     matches : Matches
+    options : SolveOptions
     *how
 
     Returns
@@ -59,19 +70,28 @@ def fit_with(terms, estimate, matches, *how):
         For more numbers than can be found at once.
     """
     values = {}
-    for _ in range(_FITS):
-        fit, *rest = estimate(matches, *how)
+    for number in range(_FITS):
         if not terms:
+            fit, *rest = estimate(matches, options, *how)
             return fit, (), rest
+        if number or not (begun := _unclipped(estimate, matches, options, *how)):
+            begun = estimate(matches, options, *how)
+        fit, *rest = begun
         numbers = _Numbers.of(terms, fit, values)
         step = numbers.step(fit, np.array([values.get(key, 0.0) for key in numbers.keys]))
         values = dict(zip(numbers.keys, step.values, strict=True))
-        if step.length < _SMALL:
+        if number and step.length < _SMALL:
             break
         matches = _displaced(fit, numbers.patterns @ step.values)
     else:
         warn(f"terms have not settled: the last change was {step.length:.2g} of an error", ConvergenceWarning)
-    return _with_errors(fit, step), numbers.found(step), rest
+    return _with_errors(fit, step, numbers), numbers.found(step), rest
+
+
+def _unclipped(estimate, matches, options, *how):
+    """The estimate with all observations, for a beginning: what a term displaces far seems to deviate. None if none."""
+    with warnings.catch_warnings(action="ignore"), contextlib.suppress(LegdistortError):
+        return estimate(matches, replace(options, clip=None, errors="stated"), *how)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +102,9 @@ class _Step:
     ----------
     values : ndarray, shape (k,)
     covariance : ndarray, shape (k, k)
-    sizes : tuple of float
-        Of every term; 0 for one that is not there.
-    gains : tuple of float
-        In twice the logarithm of the likelihood, of every term beside the others.
+    sizes, gains : ndarray, shape (n_groups,)
+        Of every group of numbers with a size of its own: this, 0 for one that is not there, and what twice the
+        logarithm of the likelihood gains by it beside the others.
     length : float
         Of the largest change, in errors.
     follow : Followed
@@ -93,8 +112,8 @@ class _Step:
 
     values: np.ndarray
     covariance: np.ndarray
-    sizes: tuple
-    gains: tuple
+    sizes: np.ndarray
+    gains: np.ndarray
     length: float
     follow: object
 
@@ -108,8 +127,11 @@ class _Numbers:
     terms : tuple of Term
     keys : list of (str, str, str)
         Term, owner and name of every number.
-    part : ndarray of int, shape (k,)
-        Term of every number.
+    n_owners : list of int
+        Owners of every term that might have numbers of their own size.
+    group : ndarray of int, shape (k,)
+        What has a size of its own: the term of every number, or its owner.
+    term_of : ndarray of int, shape (n_groups,)
     root : ndarray, shape (k, k)
         Square root of their covariance where every size is 1.
     patterns : ndarray, shape (2, n, k)
@@ -118,129 +140,184 @@ class _Numbers:
 
     terms: tuple
     keys: list
-    part: np.ndarray
+    n_owners: list
+    group: np.ndarray
+    term_of: np.ndarray
     root: np.ndarray
     patterns: np.ndarray
 
     @classmethod
     def of(cls, terms, fit, values):
         """Those of some terms in the observations of a `Fit`, made with values ``{key: value}`` of them."""
-        problem, matches = fit.problem, fit.matches
-        table, state = matches.table[problem.order], fit.result.state
-        observed = Observed(problem, state, table, matches.times[0], matches.sky, matches.camera)
-        owners = [_owners(term, observed) for term in terms]
-        keys = [[(term.name, name, each) for name in names for each in term.numbers]
-                for term, (names, _) in zip(terms, owners, strict=True)]  # fmt: skip
-        for term, mine in zip(terms, keys, strict=True):
-            if 2 * len(mine) * len(table) > _VALUES or len(mine) > _MOST:
+        keys, n_owners, sizes, roots, patterns = [], [], [], [], []
+        for term, names, owner, columns, known in _made(terms, fit, values):
+            asked = _asked(fit, owner, columns, known) if term.each else np.arange(len(names))
+            k, n = len(term.numbers), len(asked)
+            if 2 * k * n * len(owner) > _VALUES or k * n > _MOST:
                 raise SolveError(
-                    f"term {term.name} has {len(mine)} numbers for {len(table)} positions, too many to be found "
-                    f"together: take fewer, or owner 'set' in place of {term.owner!r}"
+                    f"term {term.name} has {k * n} numbers for {len(owner)} positions, too many to be found together: "
+                    f"take fewer, or owner 'set' in place of {term.owner!r}"
                 )
-        known = [np.array([values.get(key, 0.0) for key in mine]) for mine in keys]
-        # where a star falls on a pixel is known from the model better than from its position, without the term itself
-        off = np.stack([np.asarray(table[name].value) - xy for name, xy in zip("xy", problem.xy, strict=True)])
-        off = off + fit.blocks.residual
-        moved = np.zeros((len(terms), 2, len(table)))
-        for _ in range(1 + bool(values)):
-            patterns = []
-            for t, (term, (names, owner)) in enumerate(zip(terms, owners, strict=True)):
-                others = moved.sum(axis=0) - moved[t]
-                made = np.zeros((2, len(owner), len(names), len(term.numbers)))
-                columns = term.displacements(replace(observed, beside=off - others))
-                made[:, np.arange(len(owner)), owner] = np.moveaxis(columns, 0, 2)
-                patterns.append(made.reshape(2, len(owner), -1))
-            moved = np.stack([each @ mine for each, mine in zip(patterns, known, strict=True)])
-        part = np.repeat(np.arange(len(terms)), [len(mine) for mine in keys])
-        roots = [
-            np.eye(len(term.numbers)) if term.covariance is None else np.linalg.cholesky(term.covariance)
-            for term, (names, _) in zip(terms, owners, strict=True)
-            for _ in names
-        ]
-        return cls(
-            terms,
-            [key for mine in keys for key in mine],
-            part,
-            linalg.block_diag(*roots),
-            np.concatenate(patterns, axis=2),
-        )
+            place = np.full(len(names), -1)
+            place[asked] = np.arange(n)
+            rows = np.flatnonzero(place[owner] >= 0)
+            made = np.zeros((2, len(owner), n, k))
+            made[:, rows, place[owner[rows]]] = columns[:, :, rows].transpose(1, 2, 0)
+            patterns.append(made.reshape(2, len(owner), -1))
+            keys += [(term.name, names[j], number) for j in asked for number in term.numbers]
+            sizes.append(np.full(n, k) if term.each else [n * k])
+            n_owners.append(len(names) if term.each else 1)
+            roots += [np.eye(k) if term.covariance is None else np.linalg.cholesky(term.covariance)] * n
+        term_of = np.repeat(np.arange(len(terms)), list(map(len, sizes)))
+        group = np.repeat(np.arange(len(term_of)), np.concatenate(sizes).astype(int))
+        return cls(terms, keys, n_owners, group, term_of, linalg.block_diag(*roots), np.concatenate(patterns, axis=2))
 
     def step(self, fit, values):
         """The `_Step` from a fit with the numbers at some values (k,)."""
         solve = response(fit.uncertainty.system, fit.result.gauge)
         follow = followed(solve, fit.weighted, fit.blocks, -self.patterns)  # what a term displaces is taken off
         normal, pull = (self.root.T @ follow.normal @ self.root, self.root.T @ (follow.pull + follow.normal @ values))
-        unit = 1 / np.sqrt(np.maximum(np.diag(self.root.T @ np.diag(follow.alone) @ self.root), 1e-300))
-        sizes, gains = self._sizes(normal, pull, unit)
-        scale = sizes[self.part]
-        inner = np.linalg.inv(np.eye(len(scale)) + scale[:, None] * normal * scale)
-        covariance = self.root @ (scale[:, None] * inner * scale) @ self.root.T
-        new = self.root @ (scale * (inner @ (scale * pull)))
-        error = np.sqrt(np.diag(covariance))
-        moved = np.abs(new - values)
+        sizes, gains = self._sizes(normal, pull)
+        scale = sizes[self.group]
+        covariance, rest = _posterior(normal, pull, scale)
+        covariance, new = self.root @ covariance @ self.root.T, self.root @ rest
+        error, moved = np.sqrt(np.diag(covariance)), np.abs(new - values)
         length = np.max(np.divide(moved, error, out=np.where(moved > 0, np.inf, 0.0), where=error > 0), initial=0.0)
-        return _Step(new, covariance, tuple(map(float, sizes)), tuple(map(float, gains)), float(length), follow)
+        return _Step(new, covariance, sizes, gains, float(length), follow)
 
-    def _sizes(self, normal, pull, unit):
-        """Size of every term, 0 for one that is not there, and its gain beside the others."""
-        typical = np.array([np.median(unit[self.part == t]) for t in range(len(self.terms))])
-        given = np.array([np.nan if term.sigma is None else float(term.sigma) for term in self.terms])
-        sizes = np.where(np.isinf(given), _FREE * typical, given)
-        there = np.ones(len(sizes), dtype=bool)
-        while True:
-            found = self._most_likely(normal, pull, np.where(there, sizes, 0.0), typical)
-            whole = self._deviance(normal, pull, found)
-            gains = np.array([self._deviance(normal, pull, np.where(np.arange(len(found)) == t, 0.0, found)) - whole
-                              for t in range(len(found))])  # fmt: skip
-            weak = there & np.isnan(sizes) & (gains < SHOWN)
-            if not weak.any():
-                return found, gains
-            there[np.argmin(np.where(weak, gains, np.inf))] = False
+    def _sizes(self, normal, pull):
+        """Size of every group, 0 for one that is not there, and its gain beside the others."""
+        rows = [np.flatnonzero(self.group == g) for g in range(len(self.term_of))]
+        needed = SHOWN + 2 * np.log([n / _FALSE if n > 1 else 1 for n in self.n_owners])[self.term_of]
+        unit = np.array([1 / np.sqrt(max(np.median(np.diag(normal)[mine]), 1e-300)) for mine in rows])
+        given = np.array([np.nan if self.terms[t].sigma is None else float(self.terms[t].sigma) for t in self.term_of])
+        given, sought = np.where(np.isinf(given), _FREE * unit, given), np.isnan(given)
+        sizes = np.where(sought, 0.0, given)
 
-    def _most_likely(self, normal, pull, sizes, typical):
-        """Sizes with those that are NaN at the largest likelihood."""
-        sought = np.isnan(sizes)
-        if not sought.any():
-            return sizes
-        best = np.inf, np.where(sought, 0.0, sizes)
-        for start in (1.0, 30.0):
+        def best(groups):
+            """The best size of each beside the others, and its gain."""
+            there = sizes[self.group] * ~np.isin(self.group, groups)
+            left, pulled = _left(normal, pull, there)
+            return [_best_size(left[np.ix_(rows[g], rows[g])], pulled[rows[g]], unit[g], given[g]) for g in groups]
 
-            def of(logs):
-                out = sizes.copy()
-                out[sought] = np.exp(logs) * typical[sought]
-                return out
+        for _ in range(_SWEEPS):
+            last = sizes.copy()
+            for g in np.flatnonzero(sought & (sizes > 0)):
+                ((size, gain),) = best([g])
+                sizes[g] = size if gain > needed[g] else 0.0
+            absent = np.flatnonzero(sizes == 0)
+            tried = [(gain - needed[g], size, g) for g, (size, gain) in zip(absent, best(absent), strict=True)]
+            above, size, g = max(tried, default=(0, 0, 0))
+            if above > 0:
+                sizes[g] = size
+            elif np.allclose(sizes, last, rtol=1e-3, atol=0):
+                break
+        gains = np.array([best([g])[0][1] if size else 0.0 for g, size in enumerate(sizes)])
+        return sizes, gains
 
-            bounds = [(np.log(1e-3), np.log(_FREE))] * np.count_nonzero(sought)
-            found = minimize(
-                lambda logs: self._deviance(normal, pull, of(logs)),
-                np.full(np.count_nonzero(sought), np.log(start)),
-                method="L-BFGS-B",
-                bounds=bounds,
-            )
-            best = min(best, (found.fun, of(found.x)), key=lambda each: each[0])
-        return best[1]
-
-    def _deviance(self, normal, pull, sizes):
-        """Minus twice the logarithm of the restricted likelihood of sizes of the terms, against none of them."""
-        scale = sizes[self.part]
-        inner, weighed = np.eye(len(scale)) + scale[:, None] * normal * scale, scale * pull
-        return np.linalg.slogdet(inner)[1] - weighed @ np.linalg.solve(inner, weighed)
+    def shown(self, step, t):
+        """Which numbers of a term are told: all of them, or those of the owners that have it."""
+        every = np.flatnonzero(self.term_of[self.group] == t)
+        return every[step.sizes[self.group[every]] > 0] if self.terms[t].each else every
 
     def found(self, step):
         """The `FittedTerm` of every term."""
         error, moved = np.sqrt(np.diag(step.covariance)), []
         for t, term in enumerate(self.terms):
-            mine = np.flatnonzero(self.part == t)
-            rms = np.sqrt(np.mean((self.patterns[:, :, mine] @ step.values[mine]) ** 2))
-            owners, numbers = zip(*(self.keys[k][1:] for k in mine), strict=True)
+            groups, shown = self.term_of == t, self.shown(step, t)
+            every = np.flatnonzero(groups[self.group])
+            rms = np.sqrt(np.mean((self.patterns[:, :, every] @ step.values[every]) ** 2))
+            sizes = step.sizes[groups & (step.sizes > 0)]
             moved.append(
                 FittedTerm(
-                    name=term.name, unit=term.unit, owner=term.owner, size=step.sizes[t], gain=step.gains[t],
-                    found=term.sigma is None, rms=float(rms), owners=owners, numbers=numbers,
-                    values=tuple(step.values[mine].tolist()), errors=tuple(error[mine].tolist()),
+                    name=term.name, unit=term.unit, owner=term.owner,
+                    size=float(np.sqrt(np.mean(sizes**2))) if len(sizes) else 0.0,
+                    gain=float(step.gains[groups].sum()), found=term.sigma is None, rms=float(rms),
+                    n_asked=self.n_owners[t] if term.each else len({self.keys[k][1] for k in every}),
+                    owners=tuple(self.keys[k][1] for k in shown), numbers=tuple(self.keys[k][2] for k in shown),
+                    values=tuple(step.values[shown].tolist()), errors=tuple(error[shown].tolist()),
                 )
             )  # fmt: skip
         return tuple(moved)
+
+
+def _left(normal, pull, scale):
+    """Normal equations (k, k), (k,) with those numbers eliminated whose size (k,) is not 0."""
+    there = scale > 0
+    if not there.any():
+        return normal, pull
+    columns = normal[:, there] * scale[there]
+    inner = np.eye(len(columns.T)) + scale[there][:, None] * columns[there]
+    taken = columns @ np.linalg.inv(inner)
+    return normal - taken @ columns.T, pull - taken @ (scale[there] * pull[there])
+
+
+def _best_size(normal, pull, unit, given):
+    """Size at the largest likelihood, if it is not given, and twice the gain in its logarithm, against none."""
+    values, vectors = np.linalg.eigh((normal + normal.T) / 2)
+    values, along = np.maximum(values, 0), (vectors.T @ pull) ** 2
+
+    def deviance(log_size):
+        square = np.exp(2 * log_size)
+        return np.sum(np.log1p(square * values) - square * along / (1 + square * values))
+
+    if np.isfinite(given):
+        return given, -float(deviance(np.log(given)))
+    tried = np.log(unit) + np.linspace(-4, np.log(_FREE), 30)
+    at = int(np.argmin([deviance(each) for each in tried]))
+    ends = tried[max(at - 1, 0)], tried[min(at + 1, len(tried) - 1)]
+    found = minimize_scalar(deviance, bounds=ends, method="bounded")
+    return float(np.exp(found.x)), -float(found.fun)
+
+
+def _posterior(normal, pull, scale):
+    """Covariance (k, k) and mean (k,) of numbers of some sizes (k,)."""
+    inner = np.linalg.inv(np.eye(len(scale)) + scale[:, None] * normal * scale)
+    covariance = scale[:, None] * inner * scale
+    return (covariance + covariance.T) / 2, covariance @ pull
+
+
+def _made(terms, fit, values):
+    """Of every term: itself, names of its owners, that of every observation (n,), columns (k, 2, n), values by owner.
+
+    Where a star falls on a pixel is known from the model, without the term itself, better than from its position.
+    """
+    problem, matches = fit.problem, fit.matches
+    table, state = matches.table[problem.order], fit.result.state
+    observed = Observed(
+        problem, state, table, matches.times[0], matches.sky, matches.camera, matches.stars, problem.terms.epoch
+    )
+    off = np.stack([np.asarray(table[name].value) - xy for name, xy in zip("xy", problem.xy, strict=True)])
+    off, made, moved = off + fit.blocks.residual, [], np.zeros((len(terms), 2, len(table)))
+    for _ in range(1 + bool(values)):
+        made = []
+        for t, term in enumerate(terms):
+            names, owner = _owners(term, observed)
+            known = np.array([[values.get((term.name, name, each), 0.0) for each in term.numbers] for name in names])
+            columns = term.displacements(replace(observed, beside=off - moved.sum(axis=0) + moved[t]))
+            moved[t] = np.einsum("kan,nk->an", columns, known[owner])
+            made.append((term, names, owner, columns, known))
+    return made
+
+
+def _asked(fit, owner, columns, known):
+    """Which owners may have numbers, by what their own observations say, distortions held; and those that have some."""
+    problem, blocks, n = fit.weighted, fit.blocks, len(known)
+    (wx, wy, wxy), (x, y) = problem.weight, columns.transpose(1, 0, 2)
+    moved = np.stack([wx * x + wxy * y, wxy * x + wy * y])
+    pulled = problem.pulled(blocks.coupling)
+    at_star = np.einsum("san,kan->skn", pulled, columns)
+    left = np.einsum("kan,aln->kln", columns, moved)
+    pull = np.einsum("akn,an->kn", moved, blocks.residual)
+    k = len(columns)
+    normal = np.array([[np.bincount(owner, left[i, j], n) for j in range(k)] for i in range(k)]).transpose(2, 0, 1)
+    if n == problem.n_stars:  # then an owner is a star, whose position and motion follow
+        alone = np.array([[np.bincount(owner, row, n) for row in rows] for rows in at_star]).transpose(2, 0, 1)
+        normal = normal - alone.mT @ unpacked(inverse_star_blocks(blocks.v)) @ alone
+    pull = np.array([np.bincount(owner, row, n) for row in pull]).T + np.einsum("jab,jb->ja", normal, known)
+    unit = 1 / np.sqrt(np.maximum(np.median(np.einsum("jaa->ja", normal), axis=1), 1e-300))
+    gains = np.array([_best_size(*each, np.nan)[1] for each in zip(normal, pull, unit, strict=True)])
+    return np.flatnonzero((gains > _PERHAPS * (SHOWN + 2 * np.log(n / _FALSE))) | known.any(axis=1))
 
 
 def _owners(term, observed):
@@ -248,6 +325,8 @@ def _owners(term, observed):
     problem = observed.problem
     if term.owner == "exposure":
         return list(problem.names), observed.exposure
+    if term.owner == "star":
+        return [str(name) for name in observed.stars], problem.star
     if term.owner == "set":
         return [""], np.zeros(len(observed.exposure), dtype=int)
     if "detector" in observed.table.colnames:
@@ -265,7 +344,7 @@ def _displaced(fit, displacements):
     return replace(fit.matches, table=table, observations=None)
 
 
-def _with_errors(fit, step):
+def _with_errors(fit, step, numbers):
     """The fit with the errors of the numbers in those of its stars and coefficients."""
     changes = unit_errors(step.covariance)
     if not changes.shape[1]:
@@ -274,4 +353,7 @@ def _with_errors(fit, step):
     problem, parts = fit.problem, len(fit.matches.camera.detectors)
     errors = fit.camera_errors or CameraErrors.nothing(parts, problem.n_exposures, problem.n_stars, made[1].shape[1])
     freedom = float(np.sum(step.covariance * step.follow.normal))
-    return replace(fit, camera_errors=errors.beside(*made), shared_unknowns=fit.shared_unknowns + freedom)
+    told = np.concatenate([numbers.shown(step, t) for t in range(len(numbers.terms))])
+    return replace(
+        fit, camera_errors=errors.beside(*made, changes[told]), shared_unknowns=fit.shared_unknowns + freedom
+    )

@@ -4,7 +4,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from astropy import units as u
 
+from ...geometry import basis
+from ...geometry.epochs import ONE_EPOCH
 from ...inputs import column_contract
 
 _TURNED = 0.1  # rad: less is no turned camera
@@ -26,6 +29,10 @@ class Observed:
     sky : `~legdistort.geometry.tangent_plane.TangentPlane` or None
         Where the reference plane lies.
     camera : `legdistort.Camera` or None
+    stars : ndarray, shape (n_stars,)
+        Their names.
+    epoch : float or None
+        Year of the positions of stars, where motions are fitted.
     beside : ndarray, shape (2, n)
         Of measured positions, what is an error or by the term that is asked, as far as it is known, pixels.
     """
@@ -36,12 +43,25 @@ class Observed:
     times: np.ndarray
     sky: object = None
     camera: object = None
+    stars: object = ()
+    epoch: float | None = None
     beside: np.ndarray | float = 0.0
 
     @cached_property
     def exposure(self):
         """Exposure of every observation, (n,) of int."""
         return self.problem.exposure
+
+    @cached_property
+    def years(self):
+        """When the observations were made, a Julian year, (n,)."""
+        return self.values("epoch", u.yr)
+
+    @property
+    def since_epoch(self):
+        """Years since the epoch (n,), or since the mean of the observations, and the most of them, from a day on."""
+        epoch = self.years.mean() if self.epoch is None else self.epoch
+        return self.years - epoch, max(float(np.abs(self.years - epoch).max()), ONE_EPOCH)
 
     @cached_property
     def pixels(self):
@@ -111,7 +131,20 @@ class Observed:
 
     def on_detector(self, plane):
         """Displacements (2, n) of the reference plane as they are measured: on the detector, or in the focal plane."""
-        return np.einsum("nab,bn->an", self.state.poses[self.exposure][:, :, :2], plane)
+        return np.einsum("abn,bn->an", self._slope, plane)
+
+    @cached_property
+    def _slope(self):
+        """Derivatives (2, 2, n) of what is measured by the place in the reference plane."""
+        problem, state, out = self.problem, self.state, np.empty((2, 2, len(self.exposure)))
+        top = basis.degree_of(state.coefficients.shape[2])
+        for i, (shape, own) in enumerate(zip(problem.shapes, state.coefficients, strict=True)):
+            part = problem.part(i)
+            _, by_u, by_v = basis.gradients(top, *basis.normalize(problem.xy[:, part].T, shape))
+            bent = np.stack([own @ by_u * (2 / shape[1]), own @ by_v * (2 / shape[0])], axis=1)
+            bent[[0, 1], [0, 1]] += 1
+            out[:, :, part] = np.einsum("abn,bc->acn", bent, state.poses[i][:, :2])
+        return out
 
     def from_detector(self, displacements):
         """Displacements (..., 2, n) along the axes of the detectors as positions have them: in the focal plane."""

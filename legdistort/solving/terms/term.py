@@ -11,15 +11,16 @@ import numpy as np
 
 from ...exceptions import InputError
 from ...inputs.column_contract import colour_column
+from ...results.motions import PATHS
 from ...runtime.checks import check_choice
-from .displacements import PIXEL_WAVES, pixel_waves, refraction
+from .displacements import PIXEL_WAVES, accelerations, orbits, pixel_waves, refraction
 
 if TYPE_CHECKING:
     from astropy.table import Table
     from numpy.typing import ArrayLike
 
-#: Whose numbers they are: one set of them for all observations, for each exposure, or for each detector.
-OWNERS = ("set", "exposure", "detector")
+#: Whose numbers they are: one set of them for all observations, or one for each of these.
+OWNERS = ("set", "exposure", "detector", "star")
 _COLOUR, _ZENITH = "colour", ("tan_z", "parallactic_angle")
 
 
@@ -41,8 +42,10 @@ class Term:
         Names of the k numbers.
     unit : str
         Of the numbers.
-    owner : {"set", "exposure", "detector"}
-        Whether one set of them holds for all positions, or each exposure or detector has its own.
+    owner : {"set", "exposure", "detector", "star"}
+        Whether one set of them holds for all positions, or each exposure, detector or star has its own.
+    each : bool
+        Whether every owner has a size of its own, so that only those have the term which show it: few of many stars.
     sigma : float, optional
         Scatter of the numbers about 0; infinite: nothing is known of them. None: found, and the term is left away
         where twice the logarithm of the likelihood grows by less than 4.
@@ -75,6 +78,7 @@ class Term:
     numbers: tuple[str, ...]
     unit: str = "pix"
     owner: str = "set"
+    each: bool = False
     sigma: float | None = None
     covariance: np.ndarray | None = None
     needs: tuple[str, ...] = ()
@@ -92,7 +96,9 @@ class Term:
 
     @classmethod
     def named(cls, name: str, **changed: Any) -> Term:
-        """A term that the package has, "refraction" or "pixel_phase", perhaps with attributes changed.
+        """A term that the package has, perhaps with attributes changed.
+
+        "refraction", "pixel_phase", "acceleration" (of a star, constant), "orbits" (any smooth path, once round).
 
         Raises
         ------
@@ -154,6 +160,9 @@ def _checked(name, covariance, k):
 TERMS = {
     "refraction": Term("refraction", refraction, ("towards zenith",), unit="pix per unit of colour",
                        needs=(_COLOUR, *_ZENITH)),
+    "acceleration": Term("acceleration", accelerations, PATHS["acceleration"][0], unit="pix/yr2", owner="star",
+                         each=True, needs=("epoch",)),
+    "orbits": Term("orbits", orbits, PATHS["orbits"][0], owner="star", each=True, needs=("epoch",)),
     "pixel_phase": Term("pixel_phase", pixel_waves, PIXEL_WAVES, owner="detector"),
 }  # fmt: skip
 
