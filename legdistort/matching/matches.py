@@ -474,6 +474,7 @@ class Matches(ShownAsPrinted):
             table = column_contract.rename(table, columns)
         former = (getattr(table, "meta", None) or {}).get("camera")  # of a file
         table = column_contract.check(table, column_contract.MATCHED, "the table of matched positions")
+        table.remove_columns([name for name in DISPLACED if name in table.colnames])  # of an earlier solution
         if table["exposure"].dtype.kind != "U":
             table["exposure"] = table["exposure"].astype(str)
         if camera is not None:

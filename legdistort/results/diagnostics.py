@@ -325,7 +325,7 @@ class FittedTerm:
     owners, numbers : tuple of str
         Exposure or detector, and name, of every number.
     values, errors : tuple of float
-        The errors as stated errors of positions have them, `Diagnostics.error_scale` not in them.
+        In `unit`.
     """
 
     name: str

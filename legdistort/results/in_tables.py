@@ -16,7 +16,7 @@ from ..inputs import column_contract
 from . import accuracy, new_positions, nights
 from . import motions as star_motions
 from .check import in_lines
-from .errors import absolute_errors, pose_errors
+from .errors import absolute_errors, common_maps, pose_errors
 
 
 def stars(solution):
@@ -77,10 +77,9 @@ def higher_static(solution):
 
 def terms(solution):
     """See `Solution.terms`."""
-    found, scale = solution.diagnostics.terms, solution.diagnostics.error_scale
     rows = [
-        (each.name, owner, number, value, scale * error, each.unit, each.size, each.gain)
-        for each in found
+        (each.name, owner, number, value, error, each.unit, each.size, each.gain)
+        for each in solution.diagnostics.terms
         for owner, number, value, error in zip(each.owners, each.numbers, each.values, each.errors, strict=True)
     ]
     names = ("term", "owner", "number", "value", "error", "unit", "size", "gain")
@@ -96,7 +95,7 @@ def stars_at(solution, time):
     if responses.any():  # errors of a path go with those of position and motion
         rows = np.hstack([np.eye(2), estimate.motions.columns([at], sky)[0]])
         straight = rows @ estimate.uncertainty.camera.of_stars(rows.shape[1]).transpose(1, 0, 2)
-        whole = straight + responses
+        whole = straight + common_maps.without_positions(solution.gauge, estimate, responses)
         more = absolute_errors.variances(whole @ whole.mT - straight @ straight.mT)
         moved = [each + more for each in moved]
     moved[1][:, np.isnan(_absolute(solution, False)[0])] = np.nan

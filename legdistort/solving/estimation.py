@@ -256,7 +256,7 @@ def solve(
         fit, found, (options, chosen) = fit_with(asked.terms, _fitted, given, options, sought, join)
         _tell(fit, given)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
-        diagnostics = replace(_diagnostics(fit, prior, scale), pointing=given.pointing, terms=found, **chosen)
+        diagnostics = replace(_diagnostics(fit, prior, scale), pointing=given.pointing, terms=found(scale), **chosen)
         how = {"scale": scale, "epoch": epoch, "pixel_scale": pixel_scale}
         fit = _placed(fit, sought, given) if catalogue is None else reference_tie.tie_to(fit, catalogue, **how)
     epoch = given.epoch if epoch is None else epoch
@@ -515,11 +515,12 @@ def _tell_lost_stars(fit):
         seen = fit.problem.exposure[star == j]
         named.append(f"{fit.matches.stars[j]} ({some_of([fit.problem.names[i] for i in seen], MOST_NAMED)})")
     more = f" and {len(lost) - len(named)} more" * (len(lost) > len(named))
+    orbits = "stars on orbits stay with terms=['orbits'] (--term orbits); " * bool(fit.problem.terms.n)
     warn(
         f"{len(lost)} star{'s have' if len(lost) > 1 else ' has'} no position, the observations contradict one another "
         f"and there is no majority: {', '.join(named)}{more}; if a check names what displaces stars (motions, static "
-        "distortions, a layout), see to that first; else look whether they are matched rightly, or leave them out; "
-        "bright ones may have errors that are too small: errors='floor' (--errors floor)",
+        f"distortions, a layout), see to that first; {orbits}else look whether they are matched rightly, or leave them "
+        "out; bright ones may have errors that are too small: errors='floor' (--errors floor)",
         AssumptionWarning,
     )
 

@@ -239,6 +239,8 @@ SOLVE = [
     row(reference=catalogue, reference_degree=1),
     row(reference_degree=2, refused=dict.fromkeys(("plain", "one", "pair"), "is for the catalogue of reference")),
     row(reference_error=0.1, refused=dict.fromkeys(("plain", "one", "pair"), "is for the catalogue of reference")),
+    row(terms="pixel_phase"),
+    row(terms=["refraction"], refused=dict.fromkeys(("plain", "one", "pair"), "lacks the columns colour, tan_z")),
     row(progress=True),
 ]
 

@@ -15,7 +15,7 @@ from legdistort.runtime.guards.units import UNITS, plain, plain_numbers
 #: Read by themselves, with a unit of their own each.
 OWN = {"reference_error", "data", "mask", "uncertainty"}
 #: Methods for places: what these take is tested beside `View`.
-OTHERS = {"Catalogue", "CombinedNights", "EffectivePSF", "Mosaic", "Solution"}
+OTHERS = {"Catalogue", "CombinedNights", "EffectivePSF", "Mosaic", "Solution", "Term"}
 
 
 def _public():

@@ -89,6 +89,16 @@ def plain_maps(gauge, xy, n):
     return out.reshape(len(xy), rows, (2 + terms) * n)
 
 
+def without_positions(gauge, estimate, values):
+    """What is left of values (n_stars, 2, ...) at the stars once a map of the plane is fitted with their weights."""
+    common = estimate.uncertainty.common
+    if common is None:
+        return values
+    n = common.n_modes(gauge)
+    maps = plain_maps(gauge, estimate.positions, n)[:, :2, : 2 * n]
+    return values - maps @ fitted(maps, common.weights[:, :2, :2], values)
+
+
 def fitted(maps, weights, values):
     """P (c, ...) of values (n_stars, 2 + k, ...): the maps that fit them with the weights of the stars."""
     return of_normal(maps, weights) @ np.einsum("jam,ja...->m...", weights @ maps, values)

@@ -180,7 +180,8 @@ EFFECTS = (
     MOTIONS,
     Effect("refraction by colour", _by_colour,
            "stars are displaced by their colours, in every exposure along a direction of its own, as refraction does",
-           "correct the positions for differential refraction, or observe nearer the zenith or in a narrower band"),
+           "--term refraction (terms=['refraction']) finds and removes it, with tan_z and parallactic_angle; or "
+           "observe nearer the zenith or in a narrower band"),
     Effect("refraction by magnitude", _by_brightness,
            "stars are displaced by their magnitudes, in every exposure along a direction of its own, as refraction "
            "does where colours go with magnitudes",

@@ -76,14 +76,15 @@ def response(system, gauge):
     return respond
 
 
-def relative_responses(follow, changes, result, uncertainty, degree):
+def relative_responses(follow, changes, result, weights, degree):
     """Stars (n_stars, 2 + m, r) and coefficients (n_exposures, 2 n_modes, r) by changes (k, r), as a `Followed` has it.
 
-    Relative to a common map of the plane, which is taken off the stars and given to the coefficients.
+    Relative to a common map of the plane, with the `weights` (n_stars, 2 + m, 2 + m) of the stars; it is taken off
+    these and given to the coefficients.
     """
     gauge, stars = result.gauge, (follow.stars @ changes).transpose(1, 0, 2)
     maps = plain_maps(gauge, result.state.positions.T, gauge.n_modes)
-    common = fitted(maps, uncertainty.star_weights, stars)
+    common = fitted(maps, weights, stars)
     coefficients = follow.coefficients @ changes + widened_all(gauge.all_motion, degree) @ common
     return stars - maps @ common, coefficients
 

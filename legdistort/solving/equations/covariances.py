@@ -278,9 +278,21 @@ class Uncertainty:
 
     @cached_property
     def star_weights(self) -> np.ndarray:
-        """W_j (n_stars, 2 + k, 2 + k): what observations say of position, of motion and of parallax of every star."""
+        """W_j (n_stars, 2 + k, 2 + k): what observations say of position, of motion and of parallax of every star.
+
+        The numbers of terms that move it are errors of it.
+        """
+        has_terms = self.camera is not None and self.camera.numbers is not None
+        return self.weights_beside(self.camera.of_stars(self._problem.n_star) if has_terms else None)
+
+    def weights_beside(self, responses: np.ndarray | None = None) -> np.ndarray:
+        """W_j of stars that have other errors too, to units of which they respond, (2 + k, n_stars, r)."""
         v, catalogue = self._blocks.v, self._problem.terms.catalogue
         inverse = unpacked(elimination.inverse_star_blocks(v if catalogue is None else v - catalogue.precision))
+        if responses is not None:
+            determined = np.einsum("jaa->ja", inverse) > 0
+            more = np.einsum("ajr,bjr->jab", responses, responses)
+            inverse = inverse + more * (determined[:, :, None] & determined[:, None, :])
         out = np.zeros_like(inverse)
         for part in (slice(0, 2), slice(2, 4), slice(4, 5)):
             block = inverse[:, part, part]

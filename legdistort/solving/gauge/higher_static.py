@@ -36,6 +36,6 @@ def higher_errors(problem, result, uncertainty, covariance):
     changes = unit_errors(covariance)
     free = np.zeros((owner.max() + 1, 2, n_all), dtype=bool)
     free[:, :, n:] = True
-    moved = relative_responses(follow, changes, result, uncertainty, problem.degree)
+    moved = relative_responses(follow, changes, result, uncertainty.star_weights, problem.degree)
     errors = CameraErrors(free, changes, *moved, owner=owner)
     return errors, float(np.sum(covariance * follow.normal))

@@ -15,6 +15,7 @@ owner.
 import contextlib
 import warnings
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from astropy import units as u
@@ -60,7 +61,8 @@ def fit_with(terms, estimate, matches, options, *how):
     -------
     Fit
         Its errors have those of the terms, its table the displacements (`DISPLACED`).
-    tuple of FittedTerm
+    callable
+        ``found(scale)`` gives the `FittedTerm` of every term, with errors times a factor.
     rest : tuple
         What else `estimate` gave.
 
@@ -73,7 +75,7 @@ def fit_with(terms, estimate, matches, options, *how):
     for number in range(_FITS):
         if not terms:
             fit, *rest = estimate(matches, options, *how)
-            return fit, (), rest
+            return fit, lambda _: (), rest
         if number or not (begun := _unclipped(estimate, matches, options, *how)):
             begun = estimate(matches, options, *how)
         fit, *rest = begun
@@ -85,7 +87,7 @@ def fit_with(terms, estimate, matches, options, *how):
         matches = _displaced(fit, numbers.patterns @ step.values)
     else:
         warn(f"terms have not settled: the last change was {step.length:.2g} of an error", ConvergenceWarning)
-    return _with_errors(fit, step, numbers), numbers.found(step), rest
+    return _with_errors(fit, step, numbers), partial(numbers.found, step), rest
 
 
 def _unclipped(estimate, matches, options, *how):
@@ -220,9 +222,9 @@ class _Numbers:
         every = np.flatnonzero(self.term_of[self.group] == t)
         return every[step.sizes[self.group[every]] > 0] if self.terms[t].each else every
 
-    def found(self, step):
-        """The `FittedTerm` of every term."""
-        error, moved = np.sqrt(np.diag(step.covariance)), []
+    def found(self, step, scale):
+        """The `FittedTerm` of every term, with errors times a factor."""
+        error, moved = scale * np.sqrt(np.diag(step.covariance)), []
         for t, term in enumerate(self.terms):
             groups, shown = self.term_of == t, self.shown(step, t)
             every = np.flatnonzero(groups[self.group])
@@ -349,7 +351,8 @@ def _with_errors(fit, step, numbers):
     changes = unit_errors(step.covariance)
     if not changes.shape[1]:
         return fit
-    made = relative_responses(step.follow, changes, fit.result, fit.uncertainty, fit.problem.degree)
+    weights = fit.uncertainty.weights_beside(step.follow.stars @ changes)
+    made = relative_responses(step.follow, changes, fit.result, weights, fit.problem.degree)
     problem, parts = fit.problem, len(fit.matches.camera.detectors)
     errors = fit.camera_errors or CameraErrors.nothing(parts, problem.n_exposures, problem.n_stars, made[1].shape[1])
     freedom = float(np.sum(step.covariance * step.follow.normal))
