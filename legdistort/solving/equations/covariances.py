@@ -283,7 +283,7 @@ class Uncertainty:
         The numbers of terms that move it are errors of it.
         """
         has_terms = self.camera is not None and self.camera.numbers is not None
-        return self.weights_beside(self.camera.of_stars(self._problem.n_star) if has_terms else None)
+        return self.weights_beside(self.camera.of_stars(self._problem.n_star) / self._scale if has_terms else None)
 
     def weights_beside(self, responses: np.ndarray | None = None) -> np.ndarray:
         """W_j of stars that have other errors too, to units of which they respond, (2 + k, n_stars, r)."""
