@@ -35,7 +35,7 @@ def figures(bent, field, terms, seed):
     began = time.perf_counter()
     solution = displaced.solve(terms=terms, **how)
     took = time.perf_counter() - began
-    off, error = displaced.off(solution)
+    off, error = displaced.off(solution, displaced.paths(0.0))
     straight = ~np.isin(solution.stars["star"], displaced.odd) if field else slice(None)
     plain, _ = free.off(free.solve(**how))
     found = [each for each in solution.diagnostics.terms if each.size]

@@ -71,6 +71,9 @@ def test_a_term_takes_itself_away():
     for name in ("x", "y", "x_err", "vx_err", "x_err_abs"):
         assert_allclose(solution.stars[name], plain.stars[name], rtol=1e-9)
     assert "refraction: the positions do not show it" in str(solution)
+    alone = free.solve(motion="proper", terms="orbits")  # of which no star may have any
+    assert len(alone.terms) == 0
+    assert "orbits: the positions do not show it" in str(alone)
 
 
 @pytest.mark.parametrize(("term", "bent"), [("acceleration", {"acceleration": 0.02}), ("orbits", {"orbits": 3.0})])
@@ -123,7 +126,9 @@ def test_errors_are_scaled_with_the_others():
     plain, scaled = (field.solve(terms="refraction", errors=errors) for errors in ("stated", "scale"))
     scale = scaled.diagnostics.error_scale
     assert_allclose(scaled.terms["error"], scale * plain.terms["error"])
-    assert_allclose(scaled.stars["x_err"], scale * plain.stars["x_err"])
+    found, stated = (each.estimate.uncertainty for each in (scaled, plain))  # before maps are taken off
+    assert_allclose(found.stars, scale**2 * stated.stars)
+    assert_allclose(found.star_weights, stated.star_weights)
 
 
 def test_what_an_earlier_solution_took_off_is_there_again():

@@ -176,6 +176,8 @@ class _Numbers:
 
     def step(self, fit, values):
         """The `_Step` from a fit with the numbers at some values (k,)."""
+        if not self.keys:  # no owner may have any
+            return _Step(values, np.zeros((0, 0)), np.zeros(0), np.zeros(0), 0.0, None)
         solve = response(fit.uncertainty.system, fit.result.gauge)
         follow = followed(solve, fit.weighted, fit.blocks, -self.patterns)  # what a term displaces is taken off
         normal, pull = (self.root.T @ follow.normal @ self.root, self.root.T @ (follow.pull + follow.normal @ values))
