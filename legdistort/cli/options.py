@@ -99,7 +99,7 @@ MATCHED = {
     )
 }
 LEFT_OUT = {
-    "without": Option("exposures to leave out, * for any letters", nargs="+", metavar="NAME"),
+    "without": Option("exposures or nights to leave out, * for any letters", nargs="+", metavar="NAME"),
 }
 WORKERS = {"workers": Option("cores to use (default: all, where frames are not few and small)", type=int, metavar="N")}
 

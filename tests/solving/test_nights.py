@@ -197,13 +197,34 @@ def test_the_odd_night_is_named_with_all_its_exposures(tmp_path):
     assert worst["ratio"] > 10
     assert worst["p"] < 1e-20
     assert table["p"][1:].min() > 1e-3
-    sentence = next(check.sentence for check in solution.checks if check.name == "dynamic part")
-    assert re.search(rf"night 2017-12-11 \({', '.join(names)}\) 2\d times as far as the others, by 0\.3\d", sentence)
+    check = next(check for check in solution.checks if check.name == "nights")
+    found = rf"night 2017-12-11 \({', '.join(names)}\) departs 2\d times as far as the others, by 0\.3\d"
+    assert re.search(found, check.sentence)
+    assert check.state == "fail"
+    assert check.cure.endswith("solve --without 2017-12-11 leaves it out")
     assert "2017-12-11" in str(solution).splitlines()[-8]
     assert str(solution).splitlines()[-8].endswith("odd")
     solution.write(tmp_path / "solution.asdf")
     for again in (ld.Solution.read(tmp_path / "solution.asdf"), pickle.loads(pickle.dumps(solution))):
         assert again.nights.pformat() == table.pformat()
+
+
+def test_an_odd_night_is_left_out_by_its_name():
+    """By its date, its block, or, where nights have no dates, by its exposures: the cure of the check cures."""
+    table = Nights(5, per=2, odd=0.5, roll=0.7).table
+    for columns, name in (
+        ({"block": None}, "2017-12-11"),
+        ({"block": np.array(list("ABCDEFGH"))[table["block"]], "epoch": None}, "E"),
+        ({"block": None, "epoch": table["epoch"] - 2000}, "n4e0 n4e1"),
+    ):
+        given = matches(table, **columns)
+        cure = next(check.cure for check in ld.solve(given).checks if check.name == "nights")
+        assert f"--without {name} leaves it out" in cure
+        left = given.without(dict.fromkeys(name.split(), "odd"))
+        assert set(given.names) - set(left.names) == {"n4e0", "n4e1"} == set(left.left_out)
+        states = {check.name: check.state for check in ld.solve(left).checks}
+        assert states["nights"] == "pass"
+    assert list(given.nights.values()) == [[f"n{n}e{k}" for k in range(2)] for n in range(8)]
 
 
 def test_a_file_with_tests_of_other_nights_is_refused(tmp_path):

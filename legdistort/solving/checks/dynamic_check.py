@@ -1,11 +1,16 @@
-"""What exposures add to the static distortion: is it beyond noise, and does one add more than the others do?"""
+"""What exposures and nights add to the static distortion: is it beyond noise, does one add more than the others do?"""
+
+import shlex
 
 import numpy as np
 from scipy import special
 
+from ...exceptions import some_of
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
-from ...results.check import FALSE_ALARM, Check, FactorTest
+from ...results.check import FALSE_ALARM, Check, FactorTest, state_of
 from ...results.nights import table as night_table
+from .limits import MOST_NAMED
+from .night_departures import FEWEST, ODD
 
 #: Exposures of one detector from which the scatter of the others tells whether one is odd.
 _FEWEST = 6
@@ -41,20 +46,43 @@ def dynamic_check(solution, problem, blocks):
                      f"none of {len(solution.names)} exposures departs from {static} beyond noise",
                      "a lower --degree fits as well, with smaller errors")  # fmt: skip
     nights = night_table(solution)
-    nights = nights[nights["odd"]]
-    odd = [(f"night {row['name']} ({row['exposures']})", row["ratio"], row["departure"].value) for row in nights]
-    tests = [_of_night(row) for row in nights]
-    for name, ratio, rms, test in _odd(solution, problem, blocks, set(nights["block"])):
-        odd.append((name, ratio, rms))
-        tests.append(test)
-    found = f"exposures depart from {static} beyond noise"
+    odd = _odd(solution, problem, blocks, set(nights["block"][nights["odd"]]))
+    found, tests = f"exposures depart from {static} beyond noise", tuple(test for *_, test in odd)
     if odd:
-        named = [f"{name} {ratio:.2g} times as far as the others, by {rms:.2g} px rms" for name, ratio, rms in odd]
+        named = [_far(name, ratio, rms) for name, ratio, rms, _ in odd]
         found += (
             f", {', '.join(named)}: look at what was different then; its distortions are its own and count less; "
             "to compare, leave it out (--without)"
         )
-    return Check("dynamic part", "pass", p, FALSE_ALARM, found, tests=tuple(tests))
+    return Check("dynamic part", "pass", p, FALSE_ALARM, found, tests=tests)
+
+
+def nights_check(solution, *, error):
+    """Does a night depart farther than the others do? None where nothing tells. It matters beyond the error of a star."""
+    nights = night_table(solution)
+    told = nights[nights["dof"] > 0]
+    if len(told) <= FEWEST:
+        return None
+    odd = told[told["odd"]]
+    if not len(odd):
+        found = f"none of {len(nights)} nights departs farther than the others do"
+        return Check("nights", "pass", max(told["ratio"]), ODD, found)
+    found, leave_out = [], []
+    for row in odd:
+        exposures = row["exposures"].split(", ")
+        named = f"night {row['name']} ({some_of(exposures, MOST_NAMED)}) departs"
+        found.append(_far(named, row["ratio"], row["departure"].value))
+        leave_out += [row["name"]] if row["name"] not in solution.names else exposures
+    worst = odd[0]
+    state = state_of(min(1, worst["p"] * len(nights)), max(odd["departure"].value) > error)
+    return Check("nights", state, worst["ratio"], ODD,
+                 f"{'; '.join(found)}; what it departs by counts as its own, and the rest is compared without it",
+                 f"look at what was different then; solve --without {shlex.join(leave_out)} leaves it out",
+                 tests=tuple(map(_of_night, odd)))  # fmt: skip
+
+
+def _far(name, ratio, rms):
+    return f"{name} {ratio:.2g} times as far as the others, by {rms:.2g} px rms"
 
 
 def _of_night(row):

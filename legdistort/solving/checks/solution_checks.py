@@ -18,7 +18,7 @@ from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
 from ...results.errors.header_pointing import CURE as POINTING_CURE
 from .camera_check import camera_check, contradicted_layout, undetermined
 from .cures import with_cures, without_static
-from .dynamic_check import dynamic_check, significance
+from .dynamic_check import dynamic_check, nights_check, significance
 from .known_effects import Observed
 from .limits import ALIKE, ASKED, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
@@ -33,9 +33,9 @@ _CAUSES["reference"] = "chi2", "degree", "time"
 _CAUSES["duplicates"] = "degree", "time", "place"
 #: In this order checks are told.
 _ORDER = (
-    "chi2", "exposures", "brightness", "place", "time", "degree", "dynamic part", "prior", "reference", "camera",
-    "absolute", "overlaps", "extrapolation", "rejection", "stars", "completeness", "duplicates", "header distortion",
-    "header pointing",
+    "chi2", "exposures", "brightness", "place", "time", "degree", "dynamic part", "nights", "prior", "reference",
+    "camera", "absolute", "overlaps", "extrapolation", "rejection", "stars", "completeness", "duplicates",
+    "header distortion", "header pointing",
 )  # fmt: skip
 #: What only residuals tell, and what to do where they tell nothing.
 _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degree, or add stars or exposures"
@@ -76,6 +76,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
         made, explained = with_cures(made, solution, residuals, observed, judged)
     others = (
         dynamic_check(solution, problem, blocks),
+        nights_check(solution, error=_star_error(residuals)),
         prior_check(solution, problem, state, error=_star_error(residuals)),
         reference_check(solution),
         camera_check(
