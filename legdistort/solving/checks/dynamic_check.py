@@ -58,7 +58,7 @@ def dynamic_check(solution, problem, blocks):
 
 
 def nights_check(solution, *, error):
-    """Does a night depart farther than the others do? None where nothing tells. It matters beyond the error of a star."""
+    """Does a night depart farther than the others do, and than the error of a star? None where nothing tells."""
     nights = night_table(solution)
     told = nights[nights["dof"] > 0]
     if len(told) <= FEWEST:
