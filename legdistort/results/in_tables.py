@@ -19,12 +19,19 @@ from .check import in_lines
 from .errors import absolute_errors, pose_errors
 
 
-def stars(solution):
-    """`Solution.stars`; see there."""
-    estimate, sky = solution.estimate, solution.sky
-    variance = absolute_errors.relative_variance(solution.gauge, estimate.uncertainty, estimate.positions)
-    absolute = _absolute(solution, False)
-    table = _places(solution, estimate.positions, err=variance, err_abs=absolute, err_known=_absolute(solution, True))
+def stars(solution, time=None):
+    """`Solution.stars`, or `Solution.stars_at` a time; see there."""
+    estimate, sky, motions = solution.estimate, solution.sky, solution.estimate.motions
+    xy, at = estimate.positions, epoch(solution) if time is None else year(time)
+    variance = absolute_errors.relative_variance(solution.gauge, estimate.uncertainty, xy)
+    absolute, known = (_absolute(solution, without_unknown) for without_unknown in (False, True))
+    covariances = () if motions is None else _unknowns(solution)
+    if time is not None:
+        xy = xy + star_motions.fitted(motions).displacement(at, sky)
+        before, covariances = covariances, [motions.carried(each, at, sky) for each in covariances]
+        added = [absolute_errors.variances(late - early) for early, late in zip(before, covariances, strict=True)]
+        variance, absolute, known = variance + added[0], absolute + added[1], known + added[1]
+    table = _places(solution, xy, err=variance, err_abs=absolute, err_known=known)
     used = solution.residuals[solution.residuals["used"]]
     index = np.searchsorted(estimate.star_names, used["star"])
     table["n"] = np.bincount(index, minlength=len(table))
@@ -39,16 +46,16 @@ def stars(solution):
     if "flux" in used.colnames:
         with np.errstate(invalid="ignore"):
             table["flux"] = np.bincount(index, used["flux"], len(table)) / table["n"]
-    obstime = None if epoch(solution) is None else Time(epoch(solution), format="jyear")
+    obstime = None if at is None else Time(at, format="jyear")
     if sky is not None:
-        new_positions.add_sky(table, sky, estimate.positions, variance, absolute)
+        new_positions.add_sky(table, sky, xy, variance, absolute)
         table["sky"] = SkyCoord(table["ra"], table["dec"], frame="icrs", obstime=obstime)
-    if estimate.motions is not None:
-        star_motions.add_motions(table, estimate.motions, *_unknowns(solution), estimate.positions, sky)
+    if motions is not None:
+        star_motions.add_motions(table, motions, *covariances, xy, sky)
         if sky is not None:
             moving = {"pm_ra_cosdec": table["pmra"], "pm_dec": table["pmdec"]}
             table["sky"] = SkyCoord(table["ra"], table["dec"], **moving, frame="icrs", obstime=obstime)
-    table.meta = _meta(solution)
+    table.meta = _meta(solution) | {"epoch": at}
     return column_contract.describe_stars(table)
 
 
@@ -73,20 +80,6 @@ def higher_static(solution):
     for suffix, each in (("", values), ("_err", error)):
         out[f"x{suffix}"], out[f"y{suffix}"] = each.swapaxes(0, 1).reshape(2, -1) * u.pix
     return out
-
-
-def stars_at(solution, time):
-    """`Solution.stars_at`; see there."""
-    estimate, sky, at = solution.estimate, solution.sky, year(time)
-    xy = estimate.positions + star_motions.fitted(estimate.motions).displacement(at, sky)
-    moved = [estimate.motions.carried(each, at, sky) for each in _unknowns(solution)]
-    moved[1][:, np.isnan(_absolute(solution, False)[0])] = np.nan
-    table = _places(solution, xy, err=moved[0], err_abs=moved[1])
-    if sky is not None:
-        new_positions.add_sky(table, sky, xy, *moved)
-        table["sky"] = SkyCoord(table["ra"], table["dec"], frame="icrs", obstime=Time(at, format="jyear"))
-    table.meta = _meta(solution) | {"epoch": at}
-    return column_contract.describe_stars(table)
 
 
 def epoch(solution):

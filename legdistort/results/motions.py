@@ -72,10 +72,10 @@ class StarMotions(ShownAsPrinted):
         return out
 
     def carried(self, covariance: np.ndarray, years: float, sky: TangentPlane | None = None) -> np.ndarray:
-        """Covariance xx, yy, xy (3, n_stars) [pix^2] of positions at another year from that (n_stars, 2 + k, 2 + k)."""
-        rows = np.hstack([np.eye(2), self.columns([years], sky)[0]])
-        moved = rows @ covariance @ rows.T
-        return np.stack([moved[:, 0, 0], moved[:, 1, 1], moved[:, 0, 1]])
+        """Covariance (n_stars, 2 + k, 2 + k) with positions of another year from that with those of the epoch."""
+        change = np.eye(2 + len(self.names))
+        change[:2, 2:] = self.columns([years], sky)[0]
+        return change @ covariance @ change.T
 
     def __repr__(self) -> str:
         n = int(np.isfinite(self.values[:, 0]).sum())
