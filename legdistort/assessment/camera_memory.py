@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property, partial
@@ -34,7 +33,7 @@ from ..runtime.parallel import map_items
 from ..runtime.trees import codec
 from ..runtime.trees.facts import SIZE, array, number
 from .combined_nights import Chain, contradiction, fitted, own_scatter2
-from .known_maps import shown_by, sound
+from .known_maps import fingerprints, shown_by, sound
 
 if TYPE_CHECKING:
     from astropy.time import Time
@@ -47,7 +46,6 @@ LAYOUT, ROOT = 1, "legdistort_nights"
 #: Chance below which one of all nights is odd.
 ALARM = 0.003
 _MEAN_SQUARE = 8  # a coefficient of 1 px displaces by sqrt(1/8) px rms per axis
-_HASHES = 8  # positions of an exposure that are kept
 _UNKNOWN = 100.0  # error of a coefficient [pix] from which on nothing is known of it
 
 
@@ -110,7 +108,7 @@ class Night:
         counts["n_nights"] = 1 if shown.nightly is None else int(np.count_nonzero(~nights["odd"]))
         date = float(np.mean(column_contract.values(table, "epoch", u.yr))) if "epoch" in table.colnames else None
         odd = tuple(str(each) for each in nights["name"][nights["odd"]])
-        return cls(name, date=date, odd=odd, exposures=_fingerprints(solution), **counts, **given)
+        return cls(name, date=date, odd=odd, exposures=sum(fingerprints(solution).values(), ()), **counts, **given)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -495,22 +493,6 @@ def _dates(nights):
     """Years of nights, (N,); zeros if one has none."""
     dates = np.array([np.nan if each.date is None else each.date for each in nights])
     return dates if np.all(np.isfinite(dates)) else np.zeros(len(dates))
-
-
-def _fingerprints(solution):
-    """Of the positions that were measured in every exposure: those with the smallest hashes, so that some are the same
-    if other stars of it were matched.
-    """  # fmt: skip
-    table = solution.residuals
-    name, x, y = (np.asarray(getattr(table[c], "value", table[c])) for c in ("exposure", "x", "y"))
-    out = []
-    for exposure in solution.names:
-        mine = name == exposure
-        hashes = sorted(
-            hashlib.sha256(f"{a:.6f} {b:.6f}".encode()).hexdigest()[:12] for a, b in zip(x[mine], y[mine], strict=True)
-        )
-        out += hashes[:_HASHES]
-    return tuple(out)
 
 
 def _from_tree(kind, tree):
