@@ -32,7 +32,7 @@ from .given_files import given_camera, known_file, read_given, read_matches, ref
 from .repeating import repeatable
 
 #: What belongs to a reference.
-_TYING = ("reference_error", "reference_degree", "epoch", "pixel_scale")
+_TYING = ("reference_error", "reference_degree", "epoch")
 #: Size of frames from which further processes are worth their start, a second or two each.
 _MANY_BYTES = 1 << 25
 
@@ -74,7 +74,7 @@ def do_run(a):
         given(a, options.MATCHING),
         _solving(a, with_headers=True),
     )
-    own = ("psf", "degree", "prior", "clip", "min_exposures", "reference", *_TYING)
+    own = ("psf", "degree", "prior", "clip", "min_exposures", "reference", "pixel_scale", *_TYING)
     with pipeline.called_by(a.begun, repeatable(a)):
         result = legdistort.run(
             **given(a, options.RUN_FRAMES, options.FLAGGED, options.STOPPING),

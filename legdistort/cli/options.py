@@ -307,7 +307,11 @@ SOLVING = Group(
             "of a map that belongs to the catalogue alone (default: none)", type=int, metavar="D"
         ),
         "epoch": Option("of the exposures, for proper motions (default: header)", type=float, metavar="YEAR"),
-        "pixel_scale": Option("helps to find the stars without a header WCS", type=float, metavar="ARCSEC"),
+        "pixel_scale": Option(
+            "figures in mas too; helps to find the stars of a catalogue without a header WCS",
+            type=float,
+            metavar="ARCSEC",
+        ),
     },
 )
 COADDING = Group(

@@ -82,6 +82,8 @@ def solution_rows(solution, facts):
     rows |= {key.capitalize(): sentence for key, sentence in solution.diagnostics.in_words().items()}
     if solution.estimate.motions is not None:
         rows["Motions"] = solution.estimate.motions.sentence
+    if angles := in_tables.mas_sentence(solution):
+        rows["Angles"] = angles
     rows["Sky"] = in_tables.sky_sentence(solution)
     lines = [escape(f"{name}: {reason}") for name, reason in facts["left_out"].items()]
     rows["Left out"] = Markup("<br>").join(lines) if lines else "none"

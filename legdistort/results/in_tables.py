@@ -135,6 +135,43 @@ def rms(solution):
     return np.array([np.sqrt(np.mean(solution.residuals[d][used].to_value(u.pix) ** 2)) for d in ("dx", "dy")])
 
 
+def in_mas(solution):
+    """Figures in mas where a pixel scale was stated, by that of the sky if there is one; else None.
+
+    ``pixel_scale_arcsec``; ``rms_mas``, residuals per axis; medians over the stars of ``error_mas``, ``error_abs_mas``,
+    ``motion_error_mas_yr``, ``motion_error_abs_mas_yr``: None where nothing is known.
+    """
+    scale = solution.settings.pixel_scale
+    if scale is None:
+        return None
+    scale = float(scale if solution.sky is None else solution.sky.pixel_scale)
+    stars, found = (
+        solution.stars,
+        {"pixel_scale_arcsec": scale, "rms_mas": 1000 * scale * float(np.sqrt(np.mean(rms(solution) ** 2)))},
+    )
+    for name, kind in (("error", "_err"), ("error_abs", "_err_abs")):
+        for prefix, axes, unit in (("", "xy", "_mas"), ("motion_", ("vx", "vy"), "_mas_yr")):
+            columns = [stars[f"{axis}{kind}"].value for axis in axes if axis in stars.colnames]
+            known = np.concatenate([each[np.isfinite(each)] for each in columns]) if columns else np.zeros(0)
+            found[f"{prefix}{name}{unit}"] = 1000 * scale * float(np.median(known)) if len(known) else None
+    return found
+
+
+def mas_sentence(solution):
+    """The same in words; empty without a pixel scale."""
+    found = in_mas(solution)
+    if found is None:
+        return ""
+    out = f"at {found['pixel_scale_arcsec']:.6g} arcsec a pixel: residuals {found['rms_mas']:.3g} mas rms per axis"
+    for what, unit in (("error", "mas"), ("motion_error", "mas_yr")):
+        own, whole = (found[f"{what}{kind}_{unit}"] for kind in ("", "_abs"))
+        if own is not None:
+            subject = "median errors of stars" if what == "error" else "of motions"
+            out += f"; {subject} {own:.3g} {unit.replace('_', '/')}"
+            out += ", absolute not known" if whole is None else f", absolute {whole:.3g}"
+    return out
+
+
 def folds(solution):
     """Images whose map cannot be inverted, ``{label of the view: reason}``."""
     return {part.label: part.fold for view in solution for part in view.parts if part.fold}
@@ -211,6 +248,7 @@ def printed(solution):
         *_wrapped("sky", sky_sentence(solution)),
         *(_wrapped("stars", motions.sentence) if motions is not None else []),
         f"rms     {both[0]:.4f}, {both[1]:.4f} px in x, y; {np.count_nonzero(used)} of {len(used)} observations used",
+        *_wrapped("angles", mas_sentence(solution)),
         *(line for key, text in solution.diagnostics.in_words().items() for line in _wrapped(key, text)),
         "",
         *_exposure_lines(solution),

@@ -43,6 +43,8 @@ class Settings:
     pose_sigma : dict or None
         Errors of the poses that were known: ``shift`` [px], ``rotation`` [deg], ``scale``.
     max_iterations : int or None
+    pixel_scale : float or None
+        Arcsec, as it was stated.
     """
 
     degree: int | str = field(default=3, metadata=number(minimum=0, maximum=30))
@@ -66,3 +68,4 @@ class Settings:
     pose_sigma: dict[str, float] | None = None
     max_iterations: int | None = field(default=None, metadata=number(minimum=0))
     validate: float | None = field(default=None, metadata=number(minimum=0, maximum=1))
+    pixel_scale: float | None = field(default=None, metadata=number(minimum=0, unit="arcsec"))

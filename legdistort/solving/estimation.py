@@ -231,8 +231,9 @@ def solve(
         gauge=gauge, method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors,
         max_iterations=max_iterations, validate=validate, motion=motion, motion_sigma=motion_sigma,
         motion_epoch=motion_epoch, night_sigma=night_sigma, pose_sigma=matches.pose_sigma,
+        pixel_scale=pixel_scale,
     )  # fmt: skip
-    tying = {"error": reference_error, "degree": reference_degree, "epoch": epoch, "pixel_scale": pixel_scale}
+    tying = {"error": reference_error, "degree": reference_degree, "epoch": epoch}
     catalogue, epoch = check_tie(matches, asked, reference, **tying)
     if model is None:
         _warn_of_header(matches, prior)
@@ -544,7 +545,7 @@ def _settings(asked, options, form):
     made = {field.name: getattr(asked, field.name) for field in fields(Settings)}
     made |= {"degree": int(options.degree), "exposure_degree": options.own_degree}
     made |= {name: getattr(options, name) for name in ("motion", "motion_sigma")}
-    for name in ("clip", "error_floor", "validate", "motion_sigma", "night_sigma"):
+    for name in ("clip", "error_floor", "validate", "motion_sigma", "night_sigma", "pixel_scale"):
         made[name] = None if made[name] is None else float(made[name])
     prior = asked.prior
     if isinstance(prior, dict):

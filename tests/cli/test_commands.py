@@ -813,7 +813,6 @@ def test_example_files_are_read_and_stay_the_same(kind, files, tmp_path, capsys)
         ("run FRAMES --kernel turbo --out o", "--kernel is for --algorithm drizzle"),
         ("run FRAMES --algorithm exact --order 1 --out o", "--order is for --algorithm interp"),
         ("run FRAMES --epoch 2014 --out o", "--epoch is for the catalogue of --reference"),
-        ("run FRAMES --pixel-scale 0.02 --out o", "--pixel-scale is for the catalogue of --reference"),
         ("match t.ecsv --camera gsaoi --shape 9 9 --out o.ecsv", "--shape comes from --camera"),
         ("attach s.asdf FRAMES --asdf-only --max-error 0.1 --out o", "--max-error is of the header"),
         ("predict --n-exposures 9 --n-stars 80 --sigma 0.02 --origin 1", "--origin is for the table of --stars"),
