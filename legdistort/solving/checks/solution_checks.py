@@ -27,10 +27,10 @@ from .residual_tests import Residuals
 from .star_checks import overlaps_check, stars_check
 
 #: What else may be behind a check that does not pass.
-_CAUSES = dict.fromkeys(("time", "prior"), ("degree",)) | {"chi2": ("exposures", "place", "time", "degree")}
-_CAUSES |= dict.fromkeys(("exposures", "brightness", "place"), ("degree", "time"))
+_CAUSES = dict.fromkeys(("time", "prior"), ("degree",)) | {"chi2": ("exposures", "nights", "place", "time", "degree")}
+_CAUSES |= dict.fromkeys(("brightness", "place"), ("degree", "time")) | {"exposures": ("nights", "degree", "time")}
 _CAUSES["reference"] = "chi2", "degree", "time"
-_CAUSES["duplicates"] = "degree", "time", "place"
+_CAUSES["duplicates"] = "nights", "degree", "time", "place"
 #: In this order checks are told.
 _ORDER = (
     "chi2", "exposures", "brightness", "place", "time", "degree", "dynamic part", "nights", "prior", "reference",
