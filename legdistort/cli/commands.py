@@ -27,7 +27,7 @@ from ..runtime.trees.codec import from_tree
 from ..solving.choices.degree_choice import AUTO, HIGHEST
 from ..solving.options import DEGREE
 from . import options
-from .arguments import flagged, given, wants_progress
+from .arguments import flagged, given, lines_of_images, wants_progress
 from .given_files import given_camera, known_file, read_given, read_matches, refuse
 from .repeating import repeatable
 
@@ -291,7 +291,7 @@ def do_attach(a):
     kind = None if asdf_only else "head" if head else "tpv" if tpv else "sip"
     done = attach(_solution(a), **keywords, kind=kind, progress=wants_progress(a))
     errors = {item.exposure: {"path": str(item.path)} | item.errors for item in done}
-    _say(a, "\n".join(repr(item)[1:-1].partition(": ")[2] for item in done), errors)
+    _say(a, "\n".join(lines_of_images(a, done)), errors)
 
 
 def do_predict(a):

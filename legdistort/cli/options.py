@@ -22,6 +22,7 @@ from .arguments import (
 COMMON = {
     "json": Option("print figures as JSON", action="store_true"),
     "quiet": Option("no progress, only warnings", action="store_true"),
+    "verbose": Option("a line for every image", action="store_true"),
     "debug": Option("full log and traceback", action="store_true"),
 }
 FRAMES = {
