@@ -40,7 +40,7 @@ def columns(table, *names):
 
 
 def test_with_and_without_a_night_nothing_is_significant(tmp_path, capsys):
-    nights = Nights(5, nights=6, per=3, odd=0.5, roll=0.7, n_stars=150, motion=0.05)
+    nights = Nights(5, nights=6, per=3, odd=0.5, roll=0.7, n_stars=100, motion=0.05)
     whole, part = (solved(each, motion="proper") for each in (nights.table, nights.table[nights.table["block"] != 3]))
     found = ld.difference(whole, part)
     assert found.shared == part.names
