@@ -188,7 +188,8 @@ def solve(
     epoch : float or `~astropy.time.Time`, optional
         Of the exposures (a decimal year), to which proper motions carry the reference; by default from their headers.
     pixel_scale : float, optional
-        Arcsec, approximate; helps to find the stars where no header has a WCS on the sky.
+        Arcsec. Figures are printed in mas too, see `legdistort.results.in_tables.in_mas`; it helps to find the stars of
+        a reference, to the nearest 20 per cent, where no header has a WCS on the sky.
     progress : bool
         Show a progress bar of the iterations where they take more than a second.
 
