@@ -232,15 +232,16 @@ def run(
     check_results(out, overwrite)
     measuring = _step_options(MeasureOptions, measuring, "measuring", psf=psf)
     matching = _step_options(MatchOptions, matching, "matching", min_exposures=min_exposures, progress=progress)
-    solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=_known_prior(prior), clip=clip)
+    own = {"degree": degree, "prior": _known_prior(prior), "clip": clip, "pixel_scale": pixel_scale}
+    solving = _step_options(SolveOptions, solving, "solving", **own)
     coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"}, wanted=mosaic)
-    tying = _tying(reference, reference_error, reference_degree, epoch, pixel_scale)
+    tying = _tying(reference, reference_error, reference_degree, epoch)
     asked = _checked_others(workers, truth, catalogue, artificial)
     reading = {"ext": ext, "dq_good": dq_good, "weight_maps": weight_maps, "camera": camera}
     paths, reading, before = _where_to_begin(paths, earlier, measuring, **reading)
     measuring = before.measuring if before else measuring
     share, timings = {"workers": workers, "progress": progress}, _of_start()
-    with outputs.replacing_folder(out, results=RESULTS, keep=keep) as target:
+    with outputs.replacing_folder(out := Path(out), results=RESULTS, keep=keep) as target:
         check_results(out, overwrite)  # again: nobody else writes there any more
         with timed(timings, "read"):
             exposures, bad = _open_frames(paths, min_exposures, stop_at_bad, progress, reference is not None, **reading)
@@ -263,12 +264,10 @@ def run(
         with parallel.beside(partial(_report, target, solution, summary, shown, joint), workers=workers) as report:
             with timed(timings, "write"):
                 write_results(solution, target, psfs=psfs, mosaic=stack, joint=joint, progress=progress)
-                write_detections(
-                    target / "detections.ecsv", detections, exposures, Path(out), measuring=measuring, **reading
-                )
+                write_detections(target / "detections.ecsv", detections, exposures, out, measuring=measuring, **reading)
                 write_matched(target / "matched.ecsv", matches, solution.provenance["inputs"])
             summary = _written_summary(target, summary, timings, report)
-    return Run(Path(out), solution, stack, summary, joint)
+    return Run(out, solution, stack, summary, joint)
 
 
 def _coadded(exposures, solution, coadding, share, timings):
@@ -385,10 +384,10 @@ def _where_to_begin(paths, earlier, measuring, **reading):
     return before.frames if paths is None else paths, before.reading | {"camera": before.camera}, before
 
 
-def _tying(reference, error, degree, epoch, pixel_scale):
+def _tying(reference, error, degree, epoch):
     """What ties the solution to the sky, as arguments of `solve`; Gaia is asked there."""
-    known, epoch = check_reference(reference, error=error, degree=degree, epoch=epoch, pixel_scale=pixel_scale)
-    tying = {"reference": known, "epoch": epoch, "pixel_scale": pixel_scale}
+    known, epoch = check_reference(reference, error=error, degree=degree, epoch=epoch)
+    tying = {"reference": known, "epoch": epoch}
     return tying | ({"reference_error": error, "reference_degree": degree} if is_gaia(known) else {})
 
 

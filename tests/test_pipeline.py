@@ -79,7 +79,7 @@ def test_a_folder_for_the_results_is_needed(out):
         ("run --degree 99", "degree must be"),
         ("run --no-mosaic --order 1", "--order is for a mosaic, and --no-mosaic wants none: leave it out"),
         ("run --min-exposures 1", "min_exposures must be"),
-        ("run --pixel-scale -1", "--pixel-scale is for the catalogue of --reference"),
+        ("run --pixel-scale -1", "pixel_scale must be a positive number"),
         ("run --workers 0", "workers must be"),
         ("measure --fwhm 0", "fwhm must be a number between"),
         ("measure --workers 0", "workers must be"),

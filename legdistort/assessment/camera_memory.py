@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property, partial
@@ -20,7 +19,6 @@ from ..cameras.camera import Camera
 from ..cameras.detector import Detector
 from ..exceptions import InputError, some_of
 from ..geometry import basis, detector_modes, epochs
-from ..inputs import column_contract
 from ..inputs.table_files import records
 from ..plots.memory_plots import plot_memory
 from ..priors.mode_tables import mode_table
@@ -34,7 +32,8 @@ from ..runtime.parallel import map_items
 from ..runtime.trees import codec
 from ..runtime.trees.facts import SIZE, array, number
 from .combined_nights import Chain, contradiction, fitted, own_scatter2
-from .known_maps import shown_by, sound
+from .known_maps import MEAN_SQUARE
+from .night_data import Night, check_nights, dates_of, night_of
 
 if TYPE_CHECKING:
     from astropy.time import Time
@@ -46,71 +45,7 @@ if TYPE_CHECKING:
 LAYOUT, ROOT = 1, "legdistort_nights"
 #: Chance below which one of all nights is odd.
 ALARM = 0.003
-_MEAN_SQUARE = 8  # a coefficient of 1 px displaces by sqrt(1/8) px rms per axis
-_HASHES = 8  # positions of an exposure that are kept
 _UNKNOWN = 100.0  # error of a coefficient [pix] from which on nothing is known of it
-
-
-@dataclass(frozen=True, eq=False)
-class Night:
-    """What the exposures of a night say of the static distortion of their detector, and nothing else.
-
-    ``-2 ln L = z' information z - 2 pull' z`` for a step z from the map `around`, in the order of
-    `legdistort.geometry.detector_modes.dynamic_basis`: stars, departures of exposures and a common map of the plane are
-    eliminated, and what was known beforehand is left out.
-
-    Attributes
-    ----------
-    name : str
-    date : float or None
-        Mean Julian year of its exposures.
-    n_exposures, n_stars : int
-    around : ndarray, shape (2, n_modes)
-        Pixels.
-    information : ndarray, shape (k, k)
-        Pixels^-2.
-    pull : ndarray, shape (k,)
-        Pixels^-1.
-    n_nights : int
-        That it is made of: more than one if they were solved together.
-    scatter : ndarray, shape (degree,)
-        Of its exposures about it, or about their night, by degree, pixels.
-    nightly : ndarray, shape (degree,), or None
-        Of several nights, which is in the information then.
-    dof : float
-        Degrees of freedom of these.
-    odd : tuple of str
-        Of several nights that were solved together those that depart farther than the others, and were left out.
-    exposures : tuple of str
-        Fingerprints of what was measured, so that nothing counts twice.
-    """
-
-    name: str
-    _: KW_ONLY
-    date: float | None = field(metadata=number(unit="yr"))
-    n_exposures: int
-    n_stars: int
-    around: np.ndarray = field(metadata=array(2, "n_modes", unit="pix"))
-    information: np.ndarray = field(metadata=array("n_rows", "n_rows", unit="pix-2"))
-    pull: np.ndarray = field(metadata=array("n_rows", unit="pix-1"))
-    n_nights: int = field(metadata=number(minimum=1))
-    scatter: np.ndarray = field(metadata=array("n_degrees", unit="pix", minimum=0))
-    nightly: np.ndarray | None = field(metadata=array("n_degrees", unit="pix", minimum=0))
-    dof: float = field(metadata=number(minimum=0))
-    odd: tuple[str, ...] = ()
-    exposures: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, solution: Solution, name: str, around: np.ndarray | None = None) -> Night:
-        """That of a solution, linearised round a map (2, n_modes) where the night itself shows none."""
-        shown = shown_by(solution, name, around)
-        given = {each: getattr(shown, each) for each in ("around", "information", "pull", "scatter", "nightly", "dof")}
-        table, nights = solution.residuals[sound(solution)], solution.nights
-        counts = {f"n_{each}s": len(np.unique(table[each])) for each in ("exposure", "star")}
-        counts["n_nights"] = 1 if shown.nightly is None else int(np.count_nonzero(~nights["odd"]))
-        date = float(np.mean(column_contract.values(table, "epoch", u.yr))) if "epoch" in table.colnames else None
-        odd = tuple(str(each) for each in nights["name"][nights["odd"]])
-        return cls(name, date=date, odd=odd, exposures=_fingerprints(solution), **counts, **given)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -176,12 +111,10 @@ class CombinedNights(ShownAsPrinted):
 
     @cached_property
     def _chain(self):
-        information = np.stack([each.information for each in self.nights])
-        moved = np.stack([self._rows @ each.around.ravel() for each in self.nights])
-        pull = np.stack([each.pull for each in self.nights]) + np.einsum("nkl,nl->nk", information, moved)
+        given = [(self._rows @ each.around.ravel(), each.information, each.pull) for each in self.nights]
         degrees = detector_modes.dynamic_degrees(basis.n_modes(self.degree))
         scatter2 = own_scatter2(self.scatter, self.oddness, self._whole, degrees)
-        return Chain(information, pull, scatter2, self.dates, self.rate, self.walk)
+        return Chain.of(given, scatter2, self.dates, self.rate, self.walk)
 
     @property
     def _whole(self):
@@ -256,7 +189,7 @@ class CombinedNights(ShownAsPrinted):
             own = self._widths * (night.n_nights == 1)
             chi2, dof, away = contradiction(self._chain, n, own) if count > 1 else (0.0, 0, np.zeros(1))
             p = float(special.fdtrc(dof, night.dof, chi2 / dof)) if dof else 1.0
-            rms = np.sqrt(np.sum(away**2) / _MEAN_SQUARE)
+            rms = np.sqrt(np.sum(away**2) / MEAN_SQUARE)
             date = np.nan if night.date is None else night.date
             counts = night.n_nights, night.n_exposures, night.n_stars
             rows.append((night.name, date, *counts, rms, chi2, dof, p, self.oddness[n]))
@@ -289,7 +222,7 @@ class CombinedNights(ShownAsPrinted):
     @property
     def dates(self) -> np.ndarray:
         """Years of the nights, (n_nights,); zeros if one has none."""
-        return _dates(self.nights)
+        return dates_of(self.nights)
 
     @property
     def drifts(self) -> bool:
@@ -428,9 +361,9 @@ def combine_nights(
         (earlier if isinstance(thing, CombinedNights) else solved).append((label, thing))
     nights = [night for _, each in earlier for night in each.nights]
     shapes = {each.shape for _, each in earlier}
-    made = list(map_items(_made, solved, workers=workers, progress=progress, description="nights", unit="night"))
+    made = list(map_items(night_of, solved, workers=workers, progress=progress, description="nights", unit="night"))
     nights += [night for night, _ in made]
-    _check(nights, shapes | {shape for _, shape in made})
+    check_nights(nights, shapes | {shape for _, shape in made})
     name = name or (earlier[0][1].name if earlier else "camera")
     shape = next(iter(shapes | {shape for _, shape in made}))
     return _combined(nights, shape, name)
@@ -445,36 +378,6 @@ def _opened(thing):
     return Path(thing) if asdf_files.entry_of(thing, [ROOT]) is None else CombinedNights.read(thing)
 
 
-def _made(item):
-    """The night of a labelled solution or path, and the shape of its detector."""
-    label, thing = item
-    solution = thing if isinstance(thing, Solution) else Solution.read(thing)
-    if solution.camera.has_focal_plane:
-        raise InputError(f"{label} is of camera {solution.camera.name} with several detectors: solve them one by one")
-    shapes = set(solution.estimate.shapes.values())
-    return Night.of(solution, label), next(iter(shapes))
-
-
-def _check(nights, shapes):
-    """Nights of one detector and degree, no exposure twice."""
-    if len(shapes) > 1:
-        raise InputError(f"nights are of detectors of several shapes, {sorted(shapes)} (ny, nx): combine those of one")
-    degrees = {}
-    for each in nights:
-        degrees.setdefault(basis.degree_of(each.around.shape[1]), each.name)
-    if len(degrees) > 1:
-        words = ", ".join(f"{degree} ({name})" for degree, name in sorted(degrees.items()))
-        raise InputError(f"nights were solved with several degrees, {words}: solve all with one (--degree)")
-    seen = {}
-    for night in nights:
-        for position in night.exposures:
-            if position in seen:
-                raise InputError(
-                    f"{night.name} has an exposure that {seen[position]} has too: give every exposure once"
-                )
-        seen |= dict.fromkeys(night.exposures, night.name)
-
-
 def _combined(nights, shape, name):
     nights = sorted(nights, key=lambda night: np.inf if night.date is None else night.date)
     n = nights[0].around.shape[1]
@@ -486,31 +389,9 @@ def _combined(nights, shape, name):
         weight = [each.n_nights for each in whole]
         known = np.sqrt(np.average([each.nightly**2 for each in whole], axis=0, weights=weight))
     together = np.array([each.n_nights > 1 for each in nights])
-    chain, oddness, scatter = fitted(given, _dates(nights), degrees, together, known)
+    chain, oddness, scatter = fitted(given, dates_of(nights), degrees, together, known)
     drift = {"rate": chain.rate, "walk": chain.walk}
     return CombinedNights(tuple(nights), shape=shape, name=name, scatter=scatter, oddness=oddness, **drift)
-
-
-def _dates(nights):
-    """Years of nights, (N,); zeros if one has none."""
-    dates = np.array([np.nan if each.date is None else each.date for each in nights])
-    return dates if np.all(np.isfinite(dates)) else np.zeros(len(dates))
-
-
-def _fingerprints(solution):
-    """Of the positions that were measured in every exposure: those with the smallest hashes, so that some are the same
-    if other stars of it were matched.
-    """  # fmt: skip
-    table = solution.residuals
-    name, x, y = (np.asarray(getattr(table[c], "value", table[c])) for c in ("exposure", "x", "y"))
-    out = []
-    for exposure in solution.names:
-        mine = name == exposure
-        hashes = sorted(
-            hashlib.sha256(f"{a:.6f} {b:.6f}".encode()).hexdigest()[:12] for a, b in zip(x[mine], y[mine], strict=True)
-        )
-        out += hashes[:_HASHES]
-    return tuple(out)
 
 
 def _from_tree(kind, tree):

@@ -47,6 +47,13 @@ class Chain:
     rate: float = 0.0
     walk: float = 0.0
 
+    @classmethod
+    def of(cls, nights, scatter2, dates, rate=0.0, walk=0.0, *, origin=0.0):
+        """Those of nights ``(around, information, pull)`` as for `fitted`, on S from a map (K,) on."""
+        information, moved = np.stack([each[1] for each in nights]), np.stack([each[0] - origin for each in nights])
+        pull = np.stack([each[2] for each in nights]) + np.einsum("nkl,nl->nk", information, moved)
+        return cls(information, pull, scatter2, dates, rate, walk)
+
     @cached_property
     def _alone(self):
         """Information (N, K, K) and pull (N, K) of every night on S."""
@@ -152,8 +159,6 @@ def fitted(nights, dates, degrees, whole=None, scatter=None):
     whole = np.zeros(len(nights), dtype=bool) if whole is None else whole
     dated, n_scatters = np.all(np.isfinite(dates)), int(degrees.max(initial=0))
     dates = dates if dated else np.zeros(len(dates))
-    information, moved = np.stack([each[1] for each in nights]), np.stack([each[0] for each in nights]) - nights[0][0]
-    pull = np.stack([each[2] for each in nights]) + np.einsum("nkl,nl->nk", information, moved)
     drift, odd = [], np.ones(len(nights))
     if np.count_nonzero(~whole) > 1:
         keep = drawn(np.zeros(len(nights), int), max(_FEWEST, _MOST // (2 * len(degrees))))
@@ -166,7 +171,7 @@ def fitted(nights, dates, degrees, whole=None, scatter=None):
         drift, odd[keep] = [float(each) for each in sizes[n_scatters:]], part
         scatter = np.maximum(sizes[:n_scatters], _EXACT)
     scatter = np.zeros(n_scatters) if scatter is None else scatter
-    chain = Chain(information, pull, own_scatter2(scatter, odd, whole, degrees), dates, *drift)
+    chain = Chain.of(nights, own_scatter2(scatter, odd, whole, degrees), dates, *drift, origin=nights[0][0])
     for _ in range(_ROUNDS if np.count_nonzero(~whole) > 1 else 0):
         before, odd = odd, np.where(whole, 1.0, _oddness(chain, np.maximum(scatter, _EXACT)[degrees - 1]))
         chain = replace(chain, scatter2=own_scatter2(scatter, odd, whole, degrees))

@@ -1,8 +1,7 @@
 """What is known of the static distortions of detectors, from a map, a camera or a night, with its covariance."""
 
-from collections.abc import Mapping
+import hashlib
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from astropy import units as u
@@ -14,7 +13,6 @@ from ..geometry.similarity import apply, invert
 from ..matching.matches import Matches
 from ..priors.prior import Prior
 from ..results.solution import Solution
-from ..runtime.asdf_files import entry_of
 from ..solving import single_fit
 from ..solving.equations.reduced_system import DIRECT_LIMIT
 from ..solving.gauge.constraints import absorb_similarities
@@ -32,7 +30,25 @@ _NOTHING, _FREE = 1e4, 1e3  # error of a coefficient of which nothing is known, 
 _ROUNDS = 3
 _KEPT = "loss", "motion", "motion_sigma", "motion_epoch", "night_sigma"  # settings of a night
 _MOST = 500  # coefficients from which the scatter of exposures is found
+_HASHES = 8  # positions of an exposure that are kept
 _LARGER = 1.1  # sizes, by which a derivative is taken
+
+
+def fingerprints(solution):
+    """Of the positions that were measured in every exposure, ``{exposure: texts}``: those with the smallest hashes.
+
+    So some are the same if other stars of it were matched.
+    """
+    table = solution.residuals
+    name, x, y = (np.asarray(getattr(table[c], "value", table[c])) for c in ("exposure", "x", "y"))
+    out = {}
+    for exposure in solution.names:
+        mine = name == exposure
+        hashes = sorted(
+            hashlib.sha256(f"{a:.6f} {b:.6f}".encode()).hexdigest()[:12] for a, b in zip(x[mine], y[mine], strict=True)
+        )
+        out[exposure] = tuple(hashes[:_HASHES])
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,44 +80,17 @@ class KnownMap:
         return max(basis.degree_of(each.shape[1]) for each in self.statics.values())
 
 
-def opened(thing, degree, argument):
-    """A solution, camera or prior, and its label."""
-    label = f"the {argument} map"
-    if isinstance(thing, (str, Path)) or (isinstance(thing, (list, tuple)) and len(thing) == 2):
-        label = str(thing) if isinstance(thing, (str, Path)) else f"{thing[0]}, {thing[1]}"
-        thing = _read(thing, degree)
-    if isinstance(thing, Mapping):
-        raise InputError(f"{label} is a dict: compare its maps one by one, or give a Camera")
-    if not isinstance(thing, (Solution, Camera, Prior)):
-        thing = Prior.from_model(thing, degree=degree)
-    if isinstance(thing, Prior) and thing.mean is None:
-        raise InputError(f"{label} states only the size of a distortion: give a map")
-    return thing, label
-
-
 def known_map(thing, label, other=None):
-    """What a solution, camera or prior knows; the `other` is that of what it is compared with."""
+    """What a solution, nights, a camera or a prior know; the `other` is that of what it is compared with."""
     if isinstance(thing, Solution):
         if thing.camera.has_focal_plane:
             return _of_focal_plane(thing, label)
         return _of_night(thing, label, next(iter(other.statics.values())) if other else None)
-    if isinstance(thing, Camera):
-        return _of_camera(thing, label)
+    if not isinstance(thing, Prior):
+        return _of_camera(thing if isinstance(thing, Camera) else thing.camera(), label)
     widths = thing.static_sigma
     covariance = None if widths is None else np.diag(np.minimum(widths.ravel(), _NOTHING) ** 2)
     return KnownMap(label, {"1": thing.mean}, {"1": thing.shape}, covariance)
-
-
-def _read(where, degree):
-    """The camera, solution or prior in files."""
-    if isinstance(where, (str, Path)):
-        path = Path(where)
-        if path.is_dir():
-            return Solution.read(path)
-        kinds = {"legdistort_camera": Camera, "legdistort": Solution, "legdistort_prior": Prior}
-        if (entry := entry_of(path, kinds)) is not None:
-            return kinds[entry].read(path)
-    return Prior.from_file(where, degree=degree)
 
 
 def _of_camera(camera, label):

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from astropy import units as u
-from astropy.table import QTable
+from astropy.table import QTable, vstack
 from scipy import special
 
+from ..cameras.camera import Camera
 from ..exceptions import InputError, some_of
 from ..geometry import basis, detector_modes
 from ..inputs.table_files import records
 from ..plots.difference_plots import plot_difference
+from ..priors.mode_tables import mode_table
+from ..priors.prior import Prior
 from ..results.solution import Solution
+from ..runtime.asdf_files import entry_of
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
-from .known_maps import DETERMINED, MEAN_SQUARE, known_map, opened, pointed
+from .camera_memory import CombinedNights
+from .known_maps import DETERMINED, MEAN_SQUARE, fingerprints, known_map, pointed
+from .star_difference import StarDifference, compare_stars, shared_exposures
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,6 +59,13 @@ class MapDifference(ShownAsPrinted):
         Rms of the difference that the errors let expect, per axis, pixels; NaN where none is stated.
     n_undetermined : int
         Directions that are not determined to 0.3 px, rms per axis, and do not count.
+    shared : tuple of str
+        Exposures of the second that the first has too: the errors are not independent then, and the difference has
+        neither errors nor a probability.
+    stars : StarDifference or None
+        Of the stars, where two solutions have some in common.
+    refused : str
+        Why the maps of two solutions with common stars are not compared; empty where they are.
     """
 
     labels: tuple[str, str]
@@ -63,10 +77,15 @@ class MapDifference(ShownAsPrinted):
     p: float
     rms_error: float = np.nan
     n_undetermined: int = 0
+    shared: tuple[str, ...] = ()
+    stars: StarDifference | None = None
+    refused: str = ""
 
     @property
     def rms(self) -> float:
         """Root mean square of the difference over the detectors, per axis, pixels."""
+        if self.refused:
+            return np.nan
         return float(np.sqrt(np.mean([np.sum(each**2) / MEAN_SQUARE for each in self.coefficients.values()])))
 
     @property
@@ -80,29 +99,36 @@ class MapDifference(ShownAsPrinted):
         return None if not (np.isfinite(self.p) and self.dof) else self.p >= ALARM
 
     @property
+    def why_not(self) -> str:
+        """Why there is no probability, in a word or two."""
+        return "exposures in both" if self.shared else "no errors stated"
+
+    @property
     def modes(self) -> QTable:
         """One row a mode and axis: ``detector``, ``axis``, ``x_degree``, ``y_degree``, ``difference``, ``error`` [pix],
         ``significance``; shift, rotation and scale are left out.
         """  # fmt: skip
-        rows = []
+        parts = []
         for key, values in self.coefficients.items():
-            i, j = (np.asarray(each) for each in basis.orders(basis.degree_of(values.shape[1])))
-            for axis, name in enumerate("xy"):
-                for m in range(1, len(i)):
-                    error = self.errors[key][axis, m]
-                    rows.append(
-                        (key, name, i[m], j[m], values[axis, m], error, values[axis, m] / error if error else 0.0)
-                    )
-        names = ["detector", "axis", "x_degree", "y_degree", "difference", "error", "significance"]
-        out = QTable(rows=rows, names=names) if rows else QTable(names=names)
-        for name in ("difference", "error"):
-            out[name] = out[name] * u.pix
+            part = mode_table(difference=values, error=self.errors[key])
+            part.add_column(np.full(len(part), key), name="detector", index=0)
+            parts.append(part)
+        out = vstack(parts) if parts else mode_table(difference=np.zeros((2, 1)), error=np.zeros((2, 1)))
+        error = out["error"].value
+        out["significance"] = out["difference"].value / np.where(error == 0, np.inf, error)
         return out
 
     @property
     def sentence(self) -> str:
         """The result in a sentence."""
         first, second = self.labels
+        if self.refused:
+            return f"the maps of {first} and {second} are not compared: {self.refused}"
+        if self.shared:
+            return (
+                f"{second} differs from {first} by {self.rms:.2g} px rms; {some_of(list(self.shared), 3)} are in both, "
+                "so that their errors are not independent, and nothing tells how probable that is"
+            )
         if np.isnan(self.p):
             return (
                 f"{second} differs from {first} by {self.rms:.2g} px rms; neither states an error, so no more is known"
@@ -138,14 +164,17 @@ class MapDifference(ShownAsPrinted):
         figures = {"rms_px": self.rms, "rms_error_px": self.rms_error, "sigmas": self.sigmas, "chi2": self.chi2}
         figures = {name: value if value == value else None for name, value in (figures | {"p": self.p}).items()}
         more = {"agrees": self.agrees, "dof": self.dof, "n_undetermined": self.n_undetermined}
+        more |= {"shared_exposures": list(self.shared), "stars": self.stars and self.stars.to_dict()}
         return figures | more | {"sentence": self.sentence, "modes": records(self.modes)}
 
     def plot(self, *, ax: Axes | None = None, scale: float | None = None) -> Axes:
         """Picture of the difference as arrows, see `legdistort.plots.difference_plots.plot_difference`."""
+        if self.refused:
+            raise InputError(f"there is no picture of maps that are not compared: {self.refused}")
         return plot_difference(self, ax=ax, scale=scale)
 
     def __repr__(self) -> str:
-        words = f"p = {self.p:.2g}" if np.isfinite(self.p) else "no errors stated"
+        words = f"p = {self.p:.2g}" if np.isfinite(self.p) else self.why_not
         return f"<MapDifference: {self.rms:.2g} px rms, {words}>"
 
     def __str__(self) -> str:
@@ -153,12 +182,14 @@ class MapDifference(ShownAsPrinted):
         if sentence.startswith("the "):  # and no name of a file
             sentence = "T" + sentence[1:]
         lines = [f"{sentence}.", ""]
+        if self.refused:
+            return "\n".join([*lines, *self.stars.lines()])
         lines.append(f"{'detector':10s} {'axis':4s} {'mode':14s} {'difference [px]':>15s} {'error':>9s} {'sigma':>6s}")
         for row in self.modes:
             mode, error = f"L{row['x_degree']}(x) L{row['y_degree']}(y)", row["error"].value
             shown = f"{error:9.2g} {row['significance']:6.1f}" if np.isfinite(error) else f"{'-':>9s} {'-':>6s}"
             lines.append(f"{row['detector']:10s} {row['axis']:4s} {mode:14s} {row['difference'].value:15.4f} {shown}")
-        return "\n".join(lines)
+        return "\n".join([*lines, "", *self.stars.lines()] if self.stars else lines)
 
 
 @plain_numbers
@@ -167,11 +198,13 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
 
     Shift, rotation, scale and parity of either map are conventions and taken off. Of a night counts what its exposures
     determine of the static distortion by dithers and rolls, whatever prior it was solved with: they depart from it by
-    their scatter, and a common map of the plane is free.
+    their scatter, and a common map of the plane is free. Of two solutions the stars are compared too. Where exposures
+    are in both, as of a solution with and without a night, errors are not independent, and no probability is given.
 
     Parameters
     ----------
-    first, second : path, Camera, Prior, Solution, or anything that `Prior.from_model` takes with all it needs stated
+    first, second : path, Camera, Prior, Solution, CombinedNights, or anything
+        That `Prior.from_model` takes with all it needs stated.
         Paths are of camera files, of solutions or folders with one, and of all that `Prior.from_file` reads.
     degree : int
         Of the Legendre series for what is not one yet.
@@ -198,7 +231,24 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
     >>> ld.difference(old, ld.Prior(old.mean * 1.05)).agrees
     True
     """
-    one, two = opened(first, degree, "first"), opened(second, degree, "second")
+    one, two = _opened(first, degree, "first"), _opened(second, degree, "second")
+    shared, stars = _shared(one[0], two[0]), None
+    if isinstance(one[0], Solution) and isinstance(two[0], Solution):
+        stars = compare_stars(one[0], two[0], shared=bool(shared))
+    try:
+        found = _of_maps(one, two)
+    except InputError as error:
+        if stars is None:
+            raise
+        found = MapDifference((one[1], two[1]), {}, {}, {}, np.nan, 0, np.nan, refused=str(error))
+    if shared:
+        errors = {key: np.full_like(each, np.nan) for key, each in found.errors.items()}
+        found = replace(found, errors=errors, chi2=np.nan, dof=0, p=np.nan, rms_error=np.nan)
+    return replace(found, shared=shared, stars=stars)
+
+
+def _of_maps(one, two):
+    """The `MapDifference` of what was opened, as of independent data."""
     one = known_map(*one, None if isinstance(two[0], Solution) else known_map(*two))
     two = known_map(*two, one)
     if one.label == two.label:
@@ -233,6 +283,50 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
         (one.label, two.label), found, own, shapes, chi2, k if stated else 0, p if stated else np.nan, size,
         int(np.count_nonzero(~determined)),
     )  # fmt: skip
+
+
+def _shared(first, second):
+    """Names of the exposures, or of nights, that both have."""
+    if isinstance(first, Solution) and isinstance(second, Solution):
+        return shared_exposures(first, second)
+    coarse, fine = sorted((_measured(first), _measured(second)), key=len)
+    known = {mark for marks in coarse.values() for mark in marks}
+    return tuple(name for name, marks in fine.items() if known & set(marks))
+
+
+def _measured(thing):
+    """Fingerprints of what was measured, by exposure or by night; of maps none."""
+    if isinstance(thing, Solution):
+        return fingerprints(thing)
+    return {each.name: each.exposures for each in thing.nights} if isinstance(thing, CombinedNights) else {}
+
+
+def _opened(thing, degree, argument):
+    """A solution, nights, a camera or a prior, and its label."""
+    label = f"the {argument} map"
+    if isinstance(thing, (str, Path)) or (isinstance(thing, (list, tuple)) and len(thing) == 2):
+        label = str(thing) if isinstance(thing, (str, Path)) else f"{thing[0]}, {thing[1]}"
+        thing = _read(thing, degree)
+    if isinstance(thing, Mapping):
+        raise InputError(f"{label} is a dict: compare its maps one by one, or give a Camera")
+    if not isinstance(thing, (Solution, CombinedNights, Camera, Prior)):
+        thing = Prior.from_model(thing, degree=degree)
+    if isinstance(thing, Prior) and thing.mean is None:
+        raise InputError(f"{label} states only the size of a distortion: give a map")
+    return thing, label
+
+
+def _read(where, degree):
+    """The nights, camera, solution or prior in files."""
+    if isinstance(where, (str, Path)):
+        path = Path(where)
+        if path.is_dir():
+            return Solution.read(path)
+        kinds = {"legdistort_nights": CombinedNights, "legdistort_camera": Camera}
+        kinds |= {"legdistort": Solution, "legdistort_prior": Prior}
+        if (entry := entry_of(path, kinds)) is not None:
+            return kinds[entry].read(path)
+    return Prior.from_file(where, degree=degree)
 
 
 def _by_detector(values, covariance, inside, rows, keys):

@@ -5,6 +5,9 @@ import os
 import sys
 from pathlib import Path
 
+#: Images of which each has a line.
+_MOST_LINES = 10
+
 # -- values from their text
 
 
@@ -193,3 +196,12 @@ def _check_all_there(paths):
 def wants_progress(arguments):
     """Whether progress bars are shown: on a terminal, unless asked to be quiet."""
     return not arguments.quiet and sys.stderr.isatty()
+
+
+def lines_of_images(arguments, done):
+    """A line for every `~legdistort.wcs.attachment.Attachment`; of many one for the least exact of them."""
+    if len(done) > _MOST_LINES and not arguments.verbose:
+        worst = max(done, key=lambda item: max(item.errors.values(), default=0))
+        first = f"{len(done)} images, the least exact of them (--verbose lists all):"
+        return [first, *lines_of_images(arguments, [worst])]
+    return [repr(item)[1:-1].partition(": ")[2] for item in done]

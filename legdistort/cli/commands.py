@@ -27,12 +27,12 @@ from ..runtime.trees.codec import from_tree
 from ..solving.choices.degree_choice import AUTO, HIGHEST
 from ..solving.options import DEGREE
 from . import options
-from .arguments import flagged, given, wants_progress
+from .arguments import flagged, given, lines_of_images, wants_progress
 from .given_files import given_camera, known_file, read_given, read_matches, refuse
 from .repeating import repeatable
 
 #: What belongs to a reference.
-_TYING = ("reference_error", "reference_degree", "epoch", "pixel_scale")
+_TYING = ("reference_error", "reference_degree", "epoch")
 #: Size of frames from which further processes are worth their start, a second or two each.
 _MANY_BYTES = 1 << 25
 
@@ -74,7 +74,7 @@ def do_run(a):
         given(a, options.MATCHING),
         _solving(a, with_headers=True),
     )
-    own = ("psf", "degree", "prior", "clip", "min_exposures", "reference", *_TYING)
+    own = ("psf", "degree", "prior", "clip", "min_exposures", "reference", "pixel_scale", *_TYING)
     with pipeline.called_by(a.begun, repeatable(a)):
         result = legdistort.run(
             **given(a, options.RUN_FRAMES, options.FLAGGED, options.STOPPING),
@@ -291,7 +291,7 @@ def do_attach(a):
     kind = None if asdf_only else "head" if head else "tpv" if tpv else "sip"
     done = attach(_solution(a), **keywords, kind=kind, progress=wants_progress(a))
     errors = {item.exposure: {"path": str(item.path)} | item.errors for item in done}
-    _say(a, "\n".join(repr(item)[1:-1].partition(": ")[2] for item in done), errors)
+    _say(a, "\n".join(lines_of_images(a, done)), errors)
 
 
 def do_predict(a):

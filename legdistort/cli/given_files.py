@@ -56,14 +56,19 @@ def _joined(read):
 
 
 def _without(matches, patterns):
-    """The matches without the exposures that were asked to be left out."""
+    """The matches without the exposures, or nights, that were asked to be left out."""
     reasons = {}
     for pattern in patterns or ():
-        found = [name for name in matches.names if fnmatchcase(str(name), pattern)]
+        found = _like(pattern, matches.names) or _like(pattern, matches.nights)
         if not found:
-            raise InputError(f"--without {pattern} is none of the exposures: {some_of(list(matches.names), 6)}")
+            nights = f", and none of the nights: {some_of(list(matches.nights), 6)}" * (len(matches.nights) > 1)
+            raise InputError(f"--without {pattern} is none of the exposures: {some_of(list(matches.names), 6)}{nights}")
         reasons |= dict.fromkeys(found, ASKED)
     return matches.without(reasons) if reasons else matches
+
+
+def _like(pattern, names):
+    return [name for name in names if fnmatchcase(str(name), pattern)]
 
 
 def known_file(path):

@@ -22,6 +22,7 @@ from .arguments import (
 COMMON = {
     "json": Option("print figures as JSON", action="store_true"),
     "quiet": Option("no progress, only warnings", action="store_true"),
+    "verbose": Option("a line for every image", action="store_true"),
     "debug": Option("full log and traceback", action="store_true"),
 }
 FRAMES = {
@@ -99,7 +100,7 @@ MATCHED = {
     )
 }
 LEFT_OUT = {
-    "without": Option("exposures to leave out, * for any letters", nargs="+", metavar="NAME"),
+    "without": Option("exposures or nights to leave out, * for any letters", nargs="+", metavar="NAME"),
 }
 WORKERS = {"workers": Option("cores to use (default: all, where frames are not few and small)", type=int, metavar="N")}
 
@@ -307,7 +308,11 @@ SOLVING = Group(
             "of a map that belongs to the catalogue alone (default: none)", type=int, metavar="D"
         ),
         "epoch": Option("of the exposures, for proper motions (default: header)", type=float, metavar="YEAR"),
-        "pixel_scale": Option("helps to find the stars without a header WCS", type=float, metavar="ARCSEC"),
+        "pixel_scale": Option(
+            "figures in mas too; helps to find the stars of a catalogue without a header WCS",
+            type=float,
+            metavar="ARCSEC",
+        ),
         "terms": Option(
             "what displaces stars beside the distortion: refraction (column colour), pixel_phase",
             "--term",

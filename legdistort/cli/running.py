@@ -9,7 +9,7 @@ from contextlib import contextmanager, nullcontext
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from ..exceptions import LegdistortError, LegdistortWarning
-from ..runtime.progress import Bar
+from ..runtime.progress import EACH_IMAGE, Bar
 from . import commands
 from .arguments import check_paths, wants_progress
 from .process import INTERRUPTED, stoppable, tell
@@ -96,8 +96,11 @@ def _logging(arguments):
     handler.addFilter(_said_once())
     log.handlers[:], log.propagate = [handler], False
     log.setLevel(logging.DEBUG if arguments.debug else level)
+    if not (arguments.verbose or arguments.debug):
+        logging.getLogger(EACH_IMAGE).setLevel(logging.WARNING)
     try:
         yield
     finally:
         log.handlers[:], log.propagate = before[:2]
         log.setLevel(before[2])
+        logging.getLogger(EACH_IMAGE).setLevel(logging.NOTSET)

@@ -171,7 +171,7 @@ COMMANDS = {
         options.picture("picture of all coefficients against time"),
     ),
     "difference": _command(
-        "is an old distortion map still right? its difference from another, or from a night",
+        "is an old distortion map still right? its difference from another, or from a night; two solutions, with stars",
         "camera.asdf results/solution.asdf --plot difference.png",
         options.MAPS,
         options.COMPARED,

@@ -126,6 +126,20 @@ def nights(years):
     return out
 
 
+def night_labels(years, number, names):
+    """What nights are called: by their dates, in years (n,), else by the name (n,) of their first exposure.
+
+    `number` (n,) is that of the night of an exposure, from 0. Several on a date have the time beside it.
+    """
+    begins = [np.flatnonzero(number == n) for n in range(number.max() + 1)]
+    if not np.all((years > _FIRST) & (years < _LAST)):
+        return [str(names[mine[0]]) for mine in begins]
+    means = Time([years[mine].mean() for mine in begins], format="jyear")
+    dates = means.to_value("iso", subfmt="date").tolist()
+    times = means.to_value("iso", subfmt="date_hm").tolist()
+    return [time if dates.count(date) > 1 else date for date, time in zip(dates, times, strict=True)]
+
+
 def mean_epoch(headers):
     """Mean epoch of exposures by their headers (`KEYWORDS`), a Julian year, or None."""
     found = [value for value in map(header_epoch, headers) if value is not None]

@@ -7,7 +7,7 @@ from astropy import units as u
 from astropy.table import Column, QTable, Table
 
 from ..exceptions import InputError
-from ..geometry.epochs import nights, years
+from ..geometry.epochs import night_labels, nights, years
 from ..runtime import checks
 from .plain_columns import is_text, numbers, text
 
@@ -213,6 +213,19 @@ def blocks(table, first):
     if "block" in table.colnames:
         return np.unique(np.asarray(table["block"])[first], return_inverse=True)[1]
     return nights(values(table, "epoch", u.yr)[first]) if "epoch" in table.colnames else np.zeros(len(first), dtype=int)
+
+
+def nights_of(table, first):
+    """Number of the night (n_exposures,), label of every night (n_nights,), and year (n_exposures,), NaN if unknown.
+
+    Labels are those of the column ``block``, else dates, else names of first exposures.
+    """
+    number, of = blocks(table, first), np.full(len(first), np.nan)
+    if "epoch" in table.colnames:
+        of = values(table, "epoch", u.yr)[first]
+    if "block" in table.colnames:
+        return number, [str(label) for label in np.unique(np.asarray(table["block"])[first])], of
+    return number, night_labels(of, number, labels(table, "exposure")[first]), of
 
 
 def rename(table, columns):

@@ -467,8 +467,8 @@ def _read(source, default, ext, good=None):
     with readable(source.path):
         exposure = from_hdulist(source.hdulist, ext, str(source.path), source.path, good)
         if (plane := source.plane_of_weights(ext)) is not None:
-            exposure, used = _with_weights(exposure, source.weights.hdulist, plane)
-            exposure = with_weights_stated(exposure, plane.path, used)
+            exposure, doubt = _with_weights(exposure, source.weights.hdulist, plane)
+            exposure = with_weights_stated(exposure, plane.path, doubt)
         for hdu in filter(is_image, source.hdulist):
             del hdu.data  # the memory need hold but one detector of a camera
     return exposure

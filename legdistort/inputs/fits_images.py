@@ -17,7 +17,7 @@ from .frames.cards import Stated
 from .frames.pixel_flags import bad_pixels, descriptive_flags
 from .frames.statement import read_statement
 from .frames.wcs_cards import header_of_image, is_left_out, make_numbers, two_matrices
-from .frames.weight_maps import bad_and_sky_errors
+from .frames.weight_maps import bad_and_sky_errors, doubt_of_rms
 from .sky_wcs import believable_wcs, header_wcs
 
 log = logging.getLogger(__name__)
@@ -161,29 +161,27 @@ def with_weights(exposure, weights, kind):
     Returns
     -------
     exposure : Exposure
-    used : bool
-        Whether all that the map says is.
+    doubt : str
+        What is doubtful about the map, or not used of it; empty if nothing is.
     """
     bad, errors = bad_and_sky_errors(weights, kind, exposure.data, exposure.mask)
     planes = {"mask": exposure.mask | bad, "uncertainty": exposure.uncertainty}
     if errors is not None and exposure.uncertainty is None and exposure.gain:
         light = np.maximum(exposure.data - np.median(exposure.data[~planes["mask"]]), 0)
         planes["uncertainty"] = np.sqrt(errors**2 + light / exposure.gain)
-    used = errors is None or planes["uncertainty"] is not None
-    return replace(exposure, **planes), used
+    doubt = "" if errors is None or kind != "MAP_RMS" else doubt_of_rms(exposure.data, errors, planes["mask"])
+    if errors is not None and planes["uncertainty"] is None:
+        doubt = "no gain is stated, so that of the weight map only pixels without weight are used, not their noise"
+    return replace(exposure, **planes), doubt
 
 
-def with_weights_stated(exposure, path, used):
-    """An exposure with a weight map, whose statement names the map, and whether all that it says is used."""
+def with_weights_stated(exposure, path, doubt):
+    """An exposure with a weight map, whose statement names the map, and what is doubtful about it."""
     before = exposure.stated.mask
     words = [before.value, "without weight"] if before.value else ["without weight"]
     source = f"{before.source}, {path.name}" if before.value else path.name
     stated = replace(exposure.stated, mask=Stated(" and ".join(words), source))
-    if not used:
-        stated = stated.with_doubt(
-            "no gain is stated, so that of the weight map only pixels without weight are used, not their noise"
-        )
-    return replace(exposure, stated=stated)
+    return replace(exposure, stated=stated.with_doubt(doubt) if doubt else stated)
 
 
 def _alike(hdulist, hdu):

@@ -294,6 +294,12 @@ class Matches(ShownAsPrinted):
                 raise InputError(f"column 'block' has several values for exposure {name}: give one night for each")
         return column_contract.blocks(self.table, obs.first)
 
+    @cached_property
+    def nights(self) -> dict[str, list[str]]:
+        """Names of the exposures of every night, or other block (`blocks`), as `Solution.nights` calls them."""
+        number, names, _ = column_contract.nights_of(self.table, self.observations.first)
+        return {night: [self.names[i] for i in np.flatnonzero(number == n)] for n, night in enumerate(names)}
+
     @property
     def fields(self) -> np.ndarray:
         """Number of the field of every exposure (n_exposures,): groups of exposures without a common star.
@@ -330,13 +336,16 @@ class Matches(ShownAsPrinted):
         return replace(self, table=table, observations=seen, **self._by_exposure(seen.names))
 
     def without(self, reasons: Mapping[str, str]) -> Matches:
-        """The same matches without some exposures, ``{name: reason}``, which join `left_out`.
+        """The same matches without some exposures or `nights`, ``{name: reason}``; the exposures join `left_out`.
 
         Raises
         ------
         MatchError
             If what is left is one exposure, or falls apart.
         """
+        if unknown := reasons.keys() - {*self.names}:
+            of = {name: self.nights.get(name, [name]) if name in unknown else [name] for name in reasons}
+            reasons = {exposure: reasons[name] for name, exposures in of.items() for exposure in exposures}
         rows = ~np.isin(self.table["exposure"], list(reasons))
         if not rows.any():
             raise MatchError(f"no exposure agrees with the others: {reasons_of(reasons)}")

@@ -18,6 +18,7 @@ from ..inputs.frames.working_units import in_working_unit, noise_unit
 from ..runtime import outputs
 from ..runtime.guards.units import plain_numbers
 from ..runtime.parallel import map_items
+from ..runtime.progress import EACH_IMAGE
 from . import across_frames, camera_gain
 from .crowding import SAME, SHAPELY, crowding, is_crowded, is_deformed
 from .detections import FrameStars, Stars, distinct, empty_table, table_of, with_defects
@@ -284,6 +285,7 @@ def measure_with_psfs(exposures, options, *, workers=None, progress=False):
         anew = measured([exposures[i] for i in again], replace(options, psf=chosen))
         for i, one in zip(again, anew, strict=True):
             found[i] = one
+    _tell_of_all(found)
     names = [exposure.name for exposure in exposures]
     if empty := [name for name, one in zip(names, found, strict=True) if one.shape is None]:
         log.warning("%s: no star above %g times the noise", some_of(empty, 6), options.threshold)
@@ -393,6 +395,22 @@ def measure_exposure(exposure, options):
     return found._replace(table=curves.in_unit(unit).apply(found.table, options.errors))
 
 
+def _tell_of_all(found):
+    """Say what was measured in all images together."""
+    with_stars = [one for one in found if one.shape is not None]
+    if with_stars:
+        counts, widths = ([f(one) for one in with_stars] for f in (lambda one: len(one.table), _fwhm))
+        used = ", ".join(sorted({one.verdict.psf for one in with_stars}))
+        log.info(
+            "%d images measured: %d to %d detections, FWHM %.2f to %.2f px, %s",
+            len(found), min(counts), max(counts), min(widths), max(widths), used,
+        )  # fmt: skip
+
+
+def _fwhm(one):
+    return float(moffat.fwhm(one.shape))
+
+
 class MeasuredExposure(NamedTuple):
     """Detections of one exposure.
 
@@ -459,7 +477,7 @@ def measure_scaled(exposure, options):
         table = with_defects(table, defect_peaks(exposure.data, stamps.frame))
     if max_stars is not None:
         table = table[(table["flags"] & UNUSABLE) == 0][:max_stars]
-    log.info("%s: %d detections, FWHM %.2f px, %s", name, len(table), fwhm, found.verdict.psf)
+    logging.getLogger(EACH_IMAGE).info("%s: %d detections, FWHM %.2f px, %s", name, len(table), fwhm, found.verdict.psf)
     known = exposure.gain or exposure.uncertainty is not None or not len(table)
     psf = None if found.psf is None else found.psf.named(exposure=name)
     clean = (stars.flags & UNUSABLE) == 0

@@ -44,7 +44,7 @@ def plot_difference(difference, *, ax=None, scale=None):
     verdict = {
         True: "as far as is known none",
         False: f"{min(difference.sigmas, 37):.1f} sigma",
-        None: "no errors stated",
+        None: difference.why_not,
     }
     words = f"difference {difference.rms:.2g} px rms ({verdict[difference.agrees]}), arrows x {scale:g}"
     first, second = (elements.shorten(each) for each in difference.labels)

@@ -3,7 +3,9 @@
 import numpy as np
 from markupsafe import Markup, escape
 
+from ..exceptions import reasons_of
 from ..results import in_tables
+from ..results.check import WRONG
 from ..runtime.trees.codec import to_tree
 from .tables import count
 
@@ -80,6 +82,8 @@ def solution_rows(solution, facts):
     rows |= {key.capitalize(): sentence for key, sentence in solution.diagnostics.in_words().items()}
     if solution.estimate.motions is not None:
         rows["Motions"] = solution.estimate.motions.sentence
+    if angles := in_tables.mas_sentence(solution):
+        rows["Angles"] = angles
     rows["Sky"] = in_tables.sky_sentence(solution)
     lines = [escape(f"{name}: {reason}") for name, reason in facts["left_out"].items()]
     rows["Left out"] = Markup("<br>").join(lines) if lines else "none"
@@ -127,6 +131,11 @@ def methods(solution, facts, *, stacked):
         parts.append(
             f"Corrected positions of a star scatter by {per_axis(facts['sigma_px'])} (rms) over the exposures."
         )
+    if facts["left_out"]:
+        parts.append(f"Left out: {reasons_of(facts['left_out'], 6)}.")
+    for check in facts["checks"]:
+        if check["name"] == "nights" and check["state"] in WRONG:
+            parts.append(f"{check['sentence'][0].upper()}{check['sentence'][1:]}.")
     parts.append(f"Convention for what is common to all exposures: {solution.gauge.sentence}.")
     if solution.estimate.motions is not None:
         parts.append(f"Motions of the stars: {solution.estimate.motions.sentence}.")

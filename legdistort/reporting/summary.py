@@ -30,6 +30,7 @@ def summarise(solution, *, timings=None):
         "dof": float(solution.dof),
         "rms_px": float(np.sqrt(np.mean(in_tables.rms(solution) ** 2))),
         "sigma_px": float(np.sqrt(np.nanmean(square))) if np.isfinite(square).any() else None,
+        "angles": in_tables.in_mas(solution),
         "checks": [to_tree(check) for check in solution.checks],
         "gauge": solution.gauge.sentence,
         "unknown": list(solution.gauge.unknown_names),

@@ -19,12 +19,20 @@ from .check import in_lines
 from .errors import absolute_errors, common_maps, pose_errors
 
 
-def stars(solution):
-    """`Solution.stars`; see there."""
-    estimate, sky = solution.estimate, solution.sky
-    variance = absolute_errors.relative_variance(solution.gauge, estimate.uncertainty, estimate.positions)
-    absolute = _absolute(solution, False)
-    table = _places(solution, estimate.positions, err=variance, err_abs=absolute, err_known=_absolute(solution, True))
+def stars(solution, time=None):
+    """`Solution.stars`, or `Solution.stars_at` a time; see there."""
+    estimate, sky, motions = solution.estimate, solution.sky, solution.estimate.motions
+    xy, at = estimate.positions, epoch(solution) if time is None else year(time)
+    variance = absolute_errors.relative_variance(solution.gauge, estimate.uncertainty, xy)
+    absolute, known = (_absolute(solution, without_unknown) for without_unknown in (False, True))
+    covariances = () if motions is None else _unknowns(solution)
+    if time is not None:
+        bent, more = _along_paths(solution, at)
+        xy = xy + star_motions.fitted(motions).displacement(at, sky) + bent
+        before, covariances = covariances, [motions.carried(each, at, sky) + more for each in covariances]
+        added = [absolute_errors.variances(late - early) for early, late in zip(before, covariances, strict=True)]
+        variance, absolute, known = variance + added[0], absolute + added[1], known + added[1]
+    table = _places(solution, xy, err=variance, err_abs=absolute, err_known=known)
     used = solution.residuals[solution.residuals["used"]]
     index = np.searchsorted(estimate.star_names, used["star"])
     table["n"] = np.bincount(index, minlength=len(table))
@@ -39,17 +47,33 @@ def stars(solution):
     if "flux" in used.colnames:
         with np.errstate(invalid="ignore"):
             table["flux"] = np.bincount(index, used["flux"], len(table)) / table["n"]
-    obstime = None if epoch(solution) is None else Time(epoch(solution), format="jyear")
+    obstime = None if at is None else Time(at, format="jyear")
     if sky is not None:
-        new_positions.add_sky(table, sky, estimate.positions, variance, absolute)
+        new_positions.add_sky(table, sky, xy, variance, absolute)
         table["sky"] = SkyCoord(table["ra"], table["dec"], frame="icrs", obstime=obstime)
-    if estimate.motions is not None:
-        star_motions.add_motions(table, estimate.motions, *_unknowns(solution), estimate.positions, sky)
+    if motions is not None:
+        star_motions.add_motions(table, motions, *covariances, xy, sky)
         if sky is not None:
             moving = {"pm_ra_cosdec": table["pmra"], "pm_dec": table["pmdec"]}
             table["sky"] = SkyCoord(table["ra"], table["dec"], **moving, frame="icrs", obstime=obstime)
-    table.meta = _meta(solution)
+    table.meta = _meta(solution) | {"epoch": at}
     return column_contract.describe_stars(table)
+
+
+def _along_paths(solution, time):
+    """What paths that are not straight add at a time: displacements (n_stars, 2), covariances (n_stars, 2 + k, 2 + k).
+
+    Their errors go with those of position and motion.
+    """
+    estimate = solution.estimate
+    bent, responses = star_motions.curved(solution, time)
+    if not responses.any():
+        return bent, 0.0
+    change = estimate.motions.change(time, solution.sky)
+    straight = change @ estimate.uncertainty.camera.of_stars(len(change)).transpose(1, 0, 2)
+    whole = straight.copy()
+    whole[:, :2] += common_maps.without_positions(solution.gauge, estimate, responses)
+    return bent, whole @ whole.mT - straight @ straight.mT
 
 
 def _are_apart(solution, used):
@@ -84,27 +108,6 @@ def terms(solution):
     ]
     names = ("term", "owner", "number", "value", "error", "unit", "size", "gain")
     return QTable(rows=rows or None, names=names, dtype=[str] * 3 + [float] * 2 + [str] + [float] * 2)
-
-
-def stars_at(solution, time):
-    """`Solution.stars_at`; see there."""
-    estimate, sky, at = solution.estimate, solution.sky, year(time)
-    bent, responses = star_motions.curved(solution, at)
-    xy = estimate.positions + star_motions.fitted(estimate.motions).displacement(at, sky) + bent
-    moved = [estimate.motions.carried(each, at, sky) for each in _unknowns(solution)]
-    if responses.any():  # errors of a path go with those of position and motion
-        rows = np.hstack([np.eye(2), estimate.motions.columns([at], sky)[0]])
-        straight = rows @ estimate.uncertainty.camera.of_stars(rows.shape[1]).transpose(1, 0, 2)
-        whole = straight + common_maps.without_positions(solution.gauge, estimate, responses)
-        more = absolute_errors.variances(whole @ whole.mT - straight @ straight.mT)
-        moved = [each + more for each in moved]
-    moved[1][:, np.isnan(_absolute(solution, False)[0])] = np.nan
-    table = _places(solution, xy, err=moved[0], err_abs=moved[1])
-    if sky is not None:
-        new_positions.add_sky(table, sky, xy, *moved)
-        table["sky"] = SkyCoord(table["ra"], table["dec"], frame="icrs", obstime=Time(at, format="jyear"))
-    table.meta = _meta(solution) | {"epoch": at}
-    return column_contract.describe_stars(table)
 
 
 def epoch(solution):
@@ -158,6 +161,43 @@ def rms(solution):
     """Unweighted rms residual (2,) per axis of the used observations, pixels."""
     used = solution.residuals["used"]
     return np.array([np.sqrt(np.mean(solution.residuals[d][used].to_value(u.pix) ** 2)) for d in ("dx", "dy")])
+
+
+def in_mas(solution):
+    """Figures in mas where a pixel scale was stated, by that of the sky if there is one; else None.
+
+    ``pixel_scale_arcsec``; ``rms_mas``, residuals per axis; medians over the stars of ``error_mas``, ``error_abs_mas``,
+    ``motion_error_mas_yr``, ``motion_error_abs_mas_yr``: None where nothing is known.
+    """
+    scale = solution.settings.pixel_scale
+    if scale is None:
+        return None
+    scale = float(scale if solution.sky is None else solution.sky.pixel_scale)
+    stars, found = (
+        solution.stars,
+        {"pixel_scale_arcsec": scale, "rms_mas": 1000 * scale * float(np.sqrt(np.mean(rms(solution) ** 2)))},
+    )
+    for name, kind in (("error", "_err"), ("error_abs", "_err_abs")):
+        for prefix, axes, unit in (("", "xy", "_mas"), ("motion_", ("vx", "vy"), "_mas_yr")):
+            columns = [stars[f"{axis}{kind}"].value for axis in axes if axis in stars.colnames]
+            known = np.concatenate([each[np.isfinite(each)] for each in columns]) if columns else np.zeros(0)
+            found[f"{prefix}{name}{unit}"] = 1000 * scale * float(np.median(known)) if len(known) else None
+    return found
+
+
+def mas_sentence(solution):
+    """The same in words; empty without a pixel scale."""
+    found = in_mas(solution)
+    if found is None:
+        return ""
+    out = f"at {found['pixel_scale_arcsec']:.6g} arcsec a pixel: residuals {found['rms_mas']:.3g} mas rms per axis"
+    for what, unit in (("error", "mas"), ("motion_error", "mas_yr")):
+        own, whole = (found[f"{what}{kind}_{unit}"] for kind in ("", "_abs"))
+        if own is not None:
+            subject = "median errors of stars" if what == "error" else "of motions"
+            out += f"; {subject} {own:.3g} {unit.replace('_', '/')}"
+            out += ", absolute not known" if whole is None else f", absolute {whole:.3g}"
+    return out
 
 
 def folds(solution):
@@ -236,6 +276,7 @@ def printed(solution):
         *_wrapped("sky", sky_sentence(solution)),
         *(_wrapped("stars", motions.sentence) if motions is not None else []),
         f"rms     {both[0]:.4f}, {both[1]:.4f} px in x, y; {np.count_nonzero(used)} of {len(used)} observations used",
+        *_wrapped("angles", mas_sentence(solution)),
         *(line for key, text in solution.diagnostics.in_words().items() for line in _wrapped(key, text)),
         "",
         *_exposure_lines(solution),

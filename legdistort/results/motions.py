@@ -81,10 +81,15 @@ class StarMotions(ShownAsPrinted):
         return out
 
     def carried(self, covariance: np.ndarray, years: float, sky: TangentPlane | None = None) -> np.ndarray:
-        """Covariance xx, yy, xy (3, n_stars) [pix^2] of positions at another year from that (n_stars, 2 + k, 2 + k)."""
-        rows = np.hstack([np.eye(2), self.columns([years], sky)[0]])
-        moved = rows @ covariance @ rows.T
-        return np.stack([moved[:, 0, 0], moved[:, 1, 1], moved[:, 0, 1]])
+        """Covariance (n_stars, 2 + k, 2 + k) with positions of another year from that with those of the epoch."""
+        change = self.change(years, sky)
+        return change @ covariance @ change.T
+
+    def change(self, years: float, sky: TangentPlane | None = None) -> np.ndarray:
+        """How positions at another year, and what moves stars, follow these at the epoch, (2 + k, 2 + k)."""
+        out = np.eye(2 + len(self.names))
+        out[:2, 2:] = self.columns([years], sky)[0]
+        return out
 
     def __repr__(self) -> str:
         n = int(np.isfinite(self.values[:, 0]).sum())
@@ -131,7 +136,7 @@ PATHS = {
 def curved(solution, time):
     """What terms that bend the paths of stars add at a time: displacements (n_stars, 2), their responses (.., 2, r)."""
     estimate, found = solution.estimate, solution.diagnostics.terms
-    errors, motions = estimate.uncertainty.camera, estimate.motions
+    errors, motions = estimate.uncertainty.camera, fitted(estimate.motions)
     size = 0 if errors is None else errors.changes.shape[1]
     moved, responses = np.zeros((len(estimate.star_names), 2)), np.zeros((len(estimate.star_names), 2, size))
     number, index = 0, {str(name): j for j, name in enumerate(estimate.star_names)}

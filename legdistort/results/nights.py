@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from astropy import units as u
 from astropy.table import QTable
-from astropy.time import Time
 
 from ..inputs import column_contract
 from ..runtime.trees.facts import array, number
@@ -73,27 +72,12 @@ class NightsFound:
     statics: tuple[NightStatic, ...] = ()
 
 
-_DATES = 1800, 2200  # years that are dates beyond doubt
-
-
 def blocks(solution):
     """Number of the night (n_exposures,), label of every night (n_nights,), and year (n_exposures,), NaN if unknown."""
     table = solution.residuals
     names, rows = np.unique(column_contract.labels(table, "exposure"), return_index=True)
     first = rows[np.searchsorted(names, solution.names)]
-    number = column_contract.blocks(table, first)
-    years = np.full(len(first), np.nan)
-    if "epoch" in table.colnames:
-        years = column_contract.values(table, "epoch", u.yr)[first]
-    begins = [np.flatnonzero(number == n) for n in range(number.max() + 1)]
-    if "block" in table.colnames:
-        return number, [str(table["block"][first[mine[0]]]) for mine in begins], years
-    if not np.all((years > _DATES[0]) & (years < _DATES[1])):
-        return number, [solution.names[mine[0]] for mine in begins], years
-    means = Time([years[mine].mean() for mine in begins], format="jyear")
-    dates = means.to_value("iso", subfmt="date").tolist()
-    times = means.to_value("iso", subfmt="date_hm").tolist()
-    return number, [time if dates.count(date) > 1 else date for date, time in zip(dates, times, strict=True)], years
+    return column_contract.nights_of(table, first)
 
 
 def found(solution):

@@ -45,6 +45,8 @@ class Settings:
     terms : tuple of str
         Names of the terms.
     max_iterations : int or None
+    pixel_scale : float or None
+        Arcsec, as it was stated.
     """
 
     degree: int | str = field(default=3, metadata=number(minimum=0, maximum=30))
@@ -69,3 +71,4 @@ class Settings:
     terms: tuple[str, ...] = ()
     max_iterations: int | None = field(default=None, metadata=number(minimum=0))
     validate: float | None = field(default=None, metadata=number(minimum=0, maximum=1))
+    pixel_scale: float | None = field(default=None, metadata=number(minimum=0, unit="arcsec"))

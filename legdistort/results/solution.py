@@ -246,16 +246,16 @@ class Solution(ShownAsPrinted):
         Returns
         -------
         `~astropy.table.QTable`
-            ``star``, ``x``, ``y``, ``x_err``, ``y_err``, ``x_err_abs``, ``y_err_abs`` [pix], ``xy_corr`` and, with a
-            sky, ``ra``, ``dec`` [deg], their errors [mas] and correlation and ``sky``, named as in `stars`. Parallaxes
-            are in the positions. Stars without a motion stay where they are, with errors that are not known.
+            All columns of `stars`, with positions, errors and correlations of that time; the ``epoch`` of its ``meta``
+            is that time. Parallaxes are in the positions. Stars without a motion stay where they are, with errors that
+            are not known.
 
         Raises
         ------
         InputError
             If motions were not fitted.
         """
-        return in_tables.stars_at(self, epoch)
+        return in_tables.stars(self, epoch)
 
     def absolute_covariance(self, *, without_unknown: bool = False) -> np.ndarray:
         """Covariance (n_stars, 2, 2) [pix^2] of every star position with the error of the common map.

@@ -1,8 +1,11 @@
-"""Progress bars."""
+"""Progress bars, and where what is said of every image goes."""
 
 import sys
 
 from tqdm import tqdm
+
+#: Name of the logger of what is said of every image, one by one.
+EACH_IMAGE = "legdistort.each_image"
 
 
 class Bar(tqdm):

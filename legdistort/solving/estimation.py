@@ -192,7 +192,8 @@ def solve(
     epoch : float or `~astropy.time.Time`, optional
         Of the exposures (a decimal year), to which proper motions carry the reference; by default from their headers.
     pixel_scale : float, optional
-        Arcsec, approximate; helps to find the stars where no header has a WCS on the sky.
+        Arcsec. Figures are printed in mas too, see `legdistort.results.in_tables.in_mas`; it helps to find the stars of
+        a reference, to the nearest 20 per cent, where no header has a WCS on the sky.
     terms : str, Term, or a list of them, optional
         What displaces stars beside the distortion, found with everything else and left away where the positions do not
         show it: "refraction" by the colours of stars, "pixel_phase", or a `legdistort.Term` of one's own. In
@@ -239,9 +240,9 @@ def solve(
         gauge=gauge, method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors,
         max_iterations=max_iterations, validate=validate, motion=motion, motion_sigma=motion_sigma,
         motion_epoch=motion_epoch, night_sigma=night_sigma, pose_sigma=matches.pose_sigma,
-        terms=terms_of(terms, matches.table),
+        pixel_scale=pixel_scale, terms=terms_of(terms, matches.table),
     )  # fmt: skip
-    tying = {"error": reference_error, "degree": reference_degree, "epoch": epoch, "pixel_scale": pixel_scale}
+    tying = {"error": reference_error, "degree": reference_degree, "epoch": epoch}
     catalogue, epoch = check_tie(matches, asked, reference, **tying)
     if model is None:
         _warn_of_header(matches, prior)
@@ -555,7 +556,7 @@ def _settings(asked, options, form):
     made |= {"degree": int(options.degree), "exposure_degree": options.own_degree}
     made |= {name: getattr(options, name) for name in ("motion", "motion_sigma")}
     made["terms"] = tuple(term.name for term in asked.terms)
-    for name in ("clip", "error_floor", "validate", "motion_sigma", "night_sigma"):
+    for name in ("clip", "error_floor", "validate", "motion_sigma", "night_sigma", "pixel_scale"):
         made[name] = None if made[name] is None else float(made[name])
     prior = asked.prior
     if isinstance(prior, dict):

@@ -61,6 +61,8 @@ class SolveOptions(Settings):
         self._check_distortion()
         self._check_published()
         check_error_floor(self.error_floor)
+        if self.pixel_scale is not None and not (isinstance(self.pixel_scale, Real) and 0 < self.pixel_scale < np.inf):
+            raise InputError(f"pixel_scale must be a positive number of arcsec, got {self.pixel_scale!r}")
         check_choice(self.loss, LOSSES, "loss")
         check_choice(self.errors, ERRORS, "errors")
         if self.errors != "stated" and self.loss != "linear":
@@ -242,7 +244,7 @@ def prior_as_asked(prior, static):
     return named if isinstance(prior, dict) else named[None]
 
 
-def check_reference(reference, *, error=None, degree=None, epoch=None, pixel_scale=None):
+def check_reference(reference, *, error=None, degree=None, epoch=None):
     """The arguments of `solve` that concern a reference catalogue, checked: the catalogue read, and the epoch in years.
 
     Raises
@@ -250,8 +252,6 @@ def check_reference(reference, *, error=None, degree=None, epoch=None, pixel_sca
     InputError
         For options out of range and for what is no catalogue.
     """
-    if pixel_scale is not None and not (isinstance(pixel_scale, Real) and 0 < pixel_scale < np.inf):
-        raise InputError(f"pixel_scale must be a positive number of arcsec, got {pixel_scale!r}")
     epoch = year(epoch)
     if reference is None:
         for name, value in (("reference_error", error), ("reference_degree", degree)):

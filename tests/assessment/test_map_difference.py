@@ -50,7 +50,8 @@ def test_a_night_does_not_differ_from_itself():
     solution = solved(2)
     same = ld.difference(solution, solution)
     assert same.rms < 1e-6
-    assert same.p == 1
+    assert same.shared == solution.names
+    assert same.agrees is None
 
 
 def test_a_bend_is_found_with_its_stated_error():

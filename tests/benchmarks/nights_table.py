@@ -56,9 +56,10 @@ def square(nights, solution):
 def names(solution, odd):
     """Whether the exposures of the odd night are named as such, whether anything else is, and duplicates."""
     checks = {check.name: check for check in solution.checks}
-    check, nights = checks["dynamic part"], solution.nights[solution.nights["odd"]]
+    check, nights = checks["nights"], solution.nights[solution.nights["odd"]]
+    tests = check.tests + checks["dynamic part"].tests
     right = [each for each in nights["exposures"] if set(each.split(", ")) == odd and f"({each})" in check.sentence]
-    return len(right) > 0, len(check.tests) > len(right), checks["duplicates"].state != "pass"
+    return len(right) > 0, len(tests) > len(right), checks["duplicates"].state != "pass"
 
 
 def row(words, n, *, one=True):

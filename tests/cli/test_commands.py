@@ -813,7 +813,6 @@ def test_example_files_are_read_and_stay_the_same(kind, files, tmp_path, capsys)
         ("run FRAMES --kernel turbo --out o", "--kernel is for --algorithm drizzle"),
         ("run FRAMES --algorithm exact --order 1 --out o", "--order is for --algorithm interp"),
         ("run FRAMES --epoch 2014 --out o", "--epoch is for the catalogue of --reference"),
-        ("run FRAMES --pixel-scale 0.02 --out o", "--pixel-scale is for the catalogue of --reference"),
         ("match t.ecsv --camera gsaoi --shape 9 9 --out o.ecsv", "--shape comes from --camera"),
         ("attach s.asdf FRAMES --asdf-only --max-error 0.1 --out o", "--max-error is of the header"),
         ("predict --n-exposures 9 --n-stars 80 --sigma 0.02 --origin 1", "--origin is for the table of --stars"),
@@ -954,3 +953,28 @@ def test_show_names_the_detector_of_what_it_prints(tmp_path, capsys):
     assert ["GAIN of the image" in part for part in parts] == [True, True]
     assert main(["show", str(tmp_path / "a.fits"), "--ext", "SCI,1"]) == 0
     assert capsys.readouterr().out.startswith("quantity")
+
+
+def test_what_is_said_of_every_image_is_said_of_all(night, demo, tmp_path, capsys, monkeypatch):
+    """Of more than a few images a line or two, unless each is asked for."""
+    monkeypatch.setattr("legdistort.cli.arguments._MOST_LINES", 2)
+    table = str(tmp_path / "d.ecsv")
+    measure = ["measure", *map(str, night[:2]), "--psf", "moffat", "--workers", "1", "--out", table, "--overwrite"]
+    assert main(measure) == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "FWHM" in line]
+    counts = np.unique(Table.read(table)["exposure"], return_counts=True)[1]
+    assert line.startswith(f"2 images measured: {counts.min()} to {counts.max()} detections, FWHM ")
+    assert main([*measure, "--verbose"]) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "FWHM" in line]
+    assert sum(line.startswith(tuple(f"{path.stem}: " for path in night)) for line in lines) == 2
+    frames = sorted((demo / "frames").glob("*.fits"))
+    attach = ["attach", str(demo / "solution.asdf"), *map(str, frames), "--quiet", "--out", str(tmp_path / "with")]
+    capsys.readouterr()
+    assert main(attach) == 0
+    first, worst = capsys.readouterr().out.splitlines()
+    assert first == f"{len(frames)} images, the least exact of them (--verbose lists all):"
+    assert main([*attach, "--overwrite", "--verbose"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(frames)
+    errors = [float(re.search(r"SIP within (\S+) px", line)[1]) for line in lines]
+    assert lines[int(np.argmax(errors))] == worst

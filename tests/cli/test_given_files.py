@@ -1,9 +1,11 @@
 """What a command line names: exposures to leave out, files that hold no solution."""
 
 import json
+import re
 
 import numpy as np
 import pytest
+from night_sets import SIZE, Nights
 
 import legdistort as ld
 from legdistort.cli import main
@@ -26,6 +28,58 @@ def test_exposures_may_be_left_out_by_name(table, tmp_path, capsys):
     assert "2 exposures were left out: exp00, exp04: as asked (--without)" in check["sentence"]
     assert main([*line, str(tmp_path / "s"), "--without", "night*"]) == 1
     assert "--without night* is none of the exposures: exp00, exp01" in capsys.readouterr().err
+
+
+def test_an_odd_night_is_a_failure_which_its_name_cures(tmp_path, capsys):
+    table = Nights(5, per=2, odd=0.5, roll=0.7, n_stars=120).table
+    del table["block"]
+    table.write(tmp_path / "m.ecsv")
+    line = ["solve", str(tmp_path / "m.ecsv"), "--shape", str(SIZE), str(SIZE), "--quiet", "--strict", "--out"]
+    assert main([*line, str(tmp_path / "all")]) == 3
+    cure = re.search(r"solve\s+(--without\s+\S+)\s+leaves it out", capsys.readouterr().out)[1]
+    named = "Night 2017-12-11 (n4e0, n4e1) departs"
+    methods = [
+        re.search('<p class="methods">(.*?)</p>', (tmp_path / name / "report.html").read_text(), re.DOTALL)[1]
+        for name in ("all", "without")
+        if name == "all" or main([*line, str(tmp_path / name), *cure.split()]) == 0
+    ]
+    assert named in methods[0]
+    assert json.loads((tmp_path / "all" / "summary.json").read_text())["angles"] is None
+    assert named not in methods[1]
+    assert "Left out: n4e0, n4e1: as asked (--without)." in methods[1]
+    assert main([*line, str(tmp_path / "more"), "--without", "2017-12-12"]) == 1
+    assert "none of the nights: 2014-05-27, " in capsys.readouterr().err
+
+
+def test_a_stated_pixel_scale_gives_figures_in_mas(tmp_path, capsys):
+    table = Nights(5, nights=3, per=2, roll=0.7, n_stars=100, motion=0.05).table
+    table.write(tmp_path / "m.ecsv")
+    line = [
+        "solve",
+        str(tmp_path / "m.ecsv"),
+        "--shape",
+        str(SIZE),
+        str(SIZE),
+        "--motion",
+        "proper",
+        "--quiet",
+        "--out",
+    ]
+    assert main([*line, str(tmp_path / "angles"), "--pixel-scale", "0.01"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    found = json.loads((tmp_path / "angles" / "summary.json").read_text())["angles"]
+    solution = ld.Solution.read(tmp_path / "angles")
+    used = solution.residuals[solution.residuals["used"]]
+    stars, offsets = solution.stars, np.concatenate([used["dx"].value, used["dy"].value])
+    median = {name: 10 * np.nanmedian([stars[c].value for c in columns]) for name, columns in {
+        "error_mas": ("x_err", "y_err"), "error_abs_mas": ("x_err_abs", "y_err_abs"),
+        "motion_error_mas_yr": ("vx_err", "vy_err"), "motion_error_abs_mas_yr": ("vx_err_abs", "vy_err_abs"),
+    }.items()}  # fmt: skip
+    expected = median | {"pixel_scale_arcsec": 0.01, "rms_mas": 10 * np.sqrt(np.mean(offsets**2))}
+    assert found == {name: pytest.approx(value) for name, value in expected.items()}
+    words = f"at 0.01 arcsec a pixel: residuals {found['rms_mas']:.3g} mas rms per axis"
+    assert f"angles {words}" in printed
+    assert words in (tmp_path / "angles" / "report.html").read_text()
 
 
 def test_cameras_and_priors_are_shown(tmp_path, capsys):

@@ -143,6 +143,28 @@ def test_noise_of_a_map_without_a_gain_is_not_used_and_that_is_said(tmp_path):
         assert ld.read_exposures(path, weight_maps="MAP_RMS")[0].uncertainty is None
 
 
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (lambda noise: 7 / noise**2, "more than 5 times"),  # weights
+        (lambda noise: noise**2, "less than 1/5 of"),  # variances
+        (lambda noise: 3 * noise, None),  # of pixels that share their noise
+    ],
+)
+def test_a_map_that_is_none_of_the_noise_is_doubted(tmp_path, values, words, capsys):
+    rng, noise = np.random.default_rng(8), stripes((200, 200))
+    stars = rng.uniform(20, 180, (60, 2))
+    path = write(tmp_path / "a.fits", frame(rng, stars, np.full(60, 3e4), noise), values(noise), ".r.fits")
+    assert main(["show", str(path), "--weight-maps", "MAP_RMS,.r.fits"]) == 0
+    printed = " ".join("".join(capsys.readouterr()).split())
+    if words is None:
+        assert "MAP_RMS:" not in printed.replace("read as MAP_RMS:", "")
+        return
+    assert f"doubtful: the pixels scatter by {words} what the weight map states as MAP_RMS" in printed
+    with pytest.warns(AssumptionWarning, match=f"a: the pixels scatter by {words} what the weight map states"):
+        ld.open_exposures(path, weight_maps="MAP_RMS,.r.fits")
+
+
 def test_the_shell_passes_the_words_and_a_later_run_reads_the_same(tmp_path, capsys):
     rng, noise = np.random.default_rng(8), stripes((160, 160))
     path = write(

@@ -234,6 +234,7 @@ SOLVE = [
     row(pose_sigma={"shift": 1.0, "rotation": 0.1 * u.deg}),
     row(motion_sigma=0.01, refused=dict.fromkeys(("plain", "one", "pair"), "belong to motion='proper'")),
     row(reference=catalogue, epoch=2016.5, pixel_scale=0.036),
+    row(pixel_scale=0.02),
     row(reference=catalogue, motion="proper"),
     row(reference=catalogue, reference_error="found"),
     row(reference=catalogue, reference_degree=1),

@@ -92,6 +92,12 @@ def test_stars_at_another_time_are_those_of_a_solution_of_that_time(tied):
         tolerance = 0.12 if name.endswith("abs") else 0.2
         assert_allclose(there[name].value, again[name].value, rtol=tolerance, err_msg=name)
     assert there["sky"].obstime.jyear == pytest.approx(2018.0)
+    assert there.colnames == again.colnames
+    for name in ("n", "n_epochs", "span", "chi2", "vx", "vx_err", "vx_err_abs", "vx_vy_corr"):
+        assert_allclose(there[name], solution.stars[name], rtol=1e-12, err_msg=name)
+    moved, off = (np.abs(there["x_vx_corr"] - each.stars["x_vx_corr"]) for each in (solution, direct))
+    assert np.median(off) < 0.1 * np.median(moved)
+    assert there.meta == again.meta
     assert there.meta["epoch"] == 2018.0
 
 

@@ -197,13 +197,34 @@ def test_the_odd_night_is_named_with_all_its_exposures(tmp_path):
     assert worst["ratio"] > 10
     assert worst["p"] < 1e-20
     assert table["p"][1:].min() > 1e-3
-    sentence = next(check.sentence for check in solution.checks if check.name == "dynamic part")
-    assert re.search(rf"night 2017-12-11 \({', '.join(names)}\) 2\d times as far as the others, by 0\.3\d", sentence)
+    check = next(check for check in solution.checks if check.name == "nights")
+    found = rf"night 2017-12-11 \({', '.join(names)}\) departs 2\d times as far as the others, by 0\.3\d"
+    assert re.search(found, check.sentence)
+    assert check.state == "fail"
+    assert check.cure.endswith("solve --without 2017-12-11 leaves it out")
     assert "2017-12-11" in str(solution).splitlines()[-8]
     assert str(solution).splitlines()[-8].endswith("odd")
     solution.write(tmp_path / "solution.asdf")
     for again in (ld.Solution.read(tmp_path / "solution.asdf"), pickle.loads(pickle.dumps(solution))):
         assert again.nights.pformat() == table.pformat()
+
+
+def test_an_odd_night_is_left_out_by_its_name():
+    """By its date, its block, or, where nights have no dates, by its exposures: the cure of the check cures."""
+    table = Nights(5, per=2, odd=0.5, roll=0.7).table
+    for columns, name in (
+        ({"block": None}, "2017-12-11"),
+        ({"block": np.array(list("ABCDEFGH"))[table["block"]], "epoch": None}, "E"),
+        ({"block": None, "epoch": table["epoch"] - 2000}, "n4e0 n4e1"),
+    ):
+        given = matches(table, **columns)
+        cure = next(check.cure for check in ld.solve(given).checks if check.name == "nights")
+        assert f"--without {name} leaves it out" in cure
+        left = given.without(dict.fromkeys(name.split(), "odd"))
+        assert set(given.names) - set(left.names) == {"n4e0", "n4e1"} == set(left.left_out)
+        states = {check.name: check.state for check in ld.solve(left).checks}
+        assert states["nights"] == "pass"
+    assert list(given.nights.values()) == [[f"n{n}e{k}" for k in range(2)] for n in range(8)]
 
 
 def test_a_file_with_tests_of_other_nights_is_refused(tmp_path):
@@ -294,6 +315,45 @@ def test_all_that_are_odd_are_named(single):
     else:
         assert sorted(row["exposures"][:2] for row in solution.nights[:3]) == odd
         assert solution.nights["odd"].sum() == len(found) == 3
+
+
+def with_fluxes(nights):
+    """Matches of nights, whose stars have a flux."""
+    flux = 10 ** np.random.default_rng(1).uniform(2, 5, len(nights.sky))
+    nights.table["flux"] = flux[np.asarray(nights.table["star"])]
+    return matches(nights.table, block=None)
+
+
+@pytest.mark.filterwarnings("ignore:static='fit'. . of 14")  # nights that are hardly turned determine no more
+@pytest.mark.parametrize("errors", ["stated", "by-brightness"])
+def test_an_odd_night_shows_where_all_have_one_distortion(errors):
+    """By what its residuals have in common; errors that are found from these make them as large as they should be."""
+    nights = Nights(5, odd=0.2, roll=0.7, n_stars=150)
+    solution = ld.solve(with_fluxes(nights), static="fit", errors=errors)
+    table, check = solution.nights, next(check for check in solution.checks if check.name == "nights")
+    assert table["odd"].tolist() == [True] + 7 * [False]
+    assert table["exposures"][0] == "n4e0, n4e1, n4e2, n4e3, n4e4"
+    away = nights.common[4] - np.mean(np.delete(nights.common, 4, axis=0), axis=0)
+    away[:, [0, 0, 1], [0, 1, 0]] = 0  # exposures have linear maps of their own
+    if errors == "by-brightness":
+        assert table["rms_ratio"][0] < 1.15
+        assert_allclose(table["departure"][0].value, beyond_similarity(away), rtol=0.15)
+    assert check.state == "fail"
+    assert check.cure.endswith("solve --without 2017-12-11 leaves it out")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:static='fit'. . of 14")
+def test_none_is_odd_by_chance_where_all_have_one_distortion():
+    """Twelve sets each: nights that scatter, and that scatter not at all."""
+    for nightly in (0.02, 0.0):
+        sets = (Nights(seed, nightly=nightly, roll=0.7, n_stars=120) for seed in range(12))
+        tables = [ld.solve(with_fluxes(nights), static="fit", errors="by-brightness").nights for nights in sets]
+        assert not any(table["odd"].any() for table in tables)
+        p = np.concatenate([table["p"] for table in tables])
+        assert p.min() > 1e-3 / 8
+        assert np.mean(p < 0.05) < 0.15  # 0.03 and 0.12
+        assert np.mean(np.concatenate([table["ratio"] for table in tables]) ** 2) == pytest.approx(1, abs=0.15)
 
 
 @pytest.mark.slow

@@ -17,6 +17,8 @@ _HUGE = 1e30  # variances from which SWarp and SExtractor take a pixel for one w
 _ALIKE = 0.01  # by which the noise of good pixels may differ in a map that only tells good from bad ones
 _BLOCK = 32  # side of the blocks whose scatter is the noise of the sky, px
 _MAD = 1.4826
+#: Times by which pixels may scatter more, or less, than a MAP_RMS: crowded fields, noise shared by resampled pixels.
+_BELIEVED = 5.0
 
 
 @dataclass(frozen=True)
@@ -150,6 +152,18 @@ def bad_and_sky_errors(weights, kind, data, mask):
         return bad, None
     scatter = _scatter(np.where(good, data, np.nan), errors)
     return bad, errors * scatter if scatter > 0 else None
+
+
+def doubt_of_rms(data, errors, mask):
+    """Why errors (ny, nx) that a map states may be none, by the scatter of the pixels; empty if they agree."""
+    ratio = _scatter(np.where(mask, np.nan, data), errors)
+    if 1 / _BELIEVED < ratio < _BELIEVED:
+        return ""
+    size = f"more than {_BELIEVED:g} times" if ratio > 1 else f"less than 1/{_BELIEVED:g} of"
+    return (
+        f"the pixels scatter by {size} what the weight map states as MAP_RMS: is it of another kind (--weight-maps "
+        "MAP_WEIGHT, MAP_VARIANCE), or in another unit than the frame"
+    )
 
 
 def _scatter(data, errors):

@@ -1,11 +1,17 @@
-"""What exposures add to the static distortion: is it beyond noise, and does one add more than the others do?"""
+"""What exposures and nights add to the static distortion: is it beyond noise, does one add more than the others do?"""
+
+import shlex
 
 import numpy as np
 from scipy import special
 
+from ...exceptions import some_of
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
-from ...results.check import FALSE_ALARM, Check, FactorTest
+from ...results.check import FALSE_ALARM, Check, FactorTest, state_of
 from ...results.nights import table as night_table
+from .limits import MOST_NAMED
+from .night_departures import FEWEST, ODD
+from .odd_ones import beyond_chance, compared, with_others
 
 #: Exposures of one detector from which the scatter of the others tells whether one is odd.
 _FEWEST = 6
@@ -41,20 +47,43 @@ def dynamic_check(solution, problem, blocks):
                      f"none of {len(solution.names)} exposures departs from {static} beyond noise",
                      "a lower --degree fits as well, with smaller errors")  # fmt: skip
     nights = night_table(solution)
-    nights = nights[nights["odd"]]
-    odd = [(f"night {row['name']} ({row['exposures']})", row["ratio"], row["departure"].value) for row in nights]
-    tests = [_of_night(row) for row in nights]
-    for name, ratio, rms, test in _odd(solution, problem, blocks, set(nights["block"])):
-        odd.append((name, ratio, rms))
-        tests.append(test)
-    found = f"exposures depart from {static} beyond noise"
+    odd = _odd(solution, problem, blocks, set(nights["block"][nights["odd"]]))
+    found, tests = f"exposures depart from {static} beyond noise", tuple(test for *_, test in odd)
     if odd:
-        named = [f"{name} {ratio:.2g} times as far as the others, by {rms:.2g} px rms" for name, ratio, rms in odd]
+        named = [_far(name, ratio, rms) for name, ratio, rms, _ in odd]
         found += (
             f", {', '.join(named)}: look at what was different then; its distortions are its own and count less; "
             "to compare, leave it out (--without)"
         )
-    return Check("dynamic part", "pass", p, FALSE_ALARM, found, tests=tuple(tests))
+    return Check("dynamic part", "pass", p, FALSE_ALARM, found, tests=tests)
+
+
+def nights_check(solution, *, error):
+    """Does a night depart farther than the others do, and than the error of a star? None where nothing tells."""
+    nights = night_table(solution)
+    told = nights[nights["dof"] > 0]
+    if len(told) <= FEWEST:
+        return None
+    odd = told[told["odd"]]
+    if not len(odd):
+        found = f"none of {len(nights)} nights departs farther than the others do"
+        return Check("nights", "pass", max(told["ratio"]), ODD, found)
+    found, leave_out = [], []
+    for row in odd:
+        exposures = row["exposures"].split(", ")
+        named = f"night {row['name']} ({some_of(exposures, MOST_NAMED)}) departs"
+        found.append(_far(named, row["ratio"], row["departure"].value))
+        leave_out += [row["name"]] if row["name"] not in solution.names else exposures
+    worst = odd[0]
+    state = state_of(min(1, worst["p"] * len(nights)), max(odd["departure"].value) > error)
+    return Check("nights", state, worst["ratio"], ODD,
+                 f"{'; '.join(found)}; what it departs by counts as its own, and the rest is compared without it",
+                 f"look at what was different then; solve --without {shlex.join(leave_out)} leaves it out",
+                 tests=tuple(map(_of_night, odd)))  # fmt: skip
+
+
+def _far(name, ratio, rms):
+    return f"{name} {ratio:.2g} times as far as the others, by {rms:.2g} px rms"
 
 
 def _of_night(row):
@@ -80,45 +109,13 @@ def _odd(solution, problem, blocks, nights):
         rows = dynamic_basis(problem.shapes[each[0]], size)
         a = (solution.coefficients - solution.estimate.prior_mean)[each, :, :size].reshape(len(each), -1) @ rows.T
         noise = np.einsum("ka,iab,kb->ik", rows, np.linalg.inv(blocks.u[each]), rows)
-        out = _beyond_chance(a, noise, degrees, FALSE_ALARM / len(names))
+        out = beyond_chance(a, noise, degrees, FALSE_ALARM / len(names), fewest=_FEWEST - 1)
         for k in out:
-            others = np.delete(np.arange(len(each)), [i for i in out if i != k])
-            ratio, chi2, p = (value[others == k][0] for value in _compared(a[others], noise[others], degrees))
+            others = with_others(a, out, k)
+            ratio, chi2, p = (value[others == k][0] for value in compared(a[others], noise[others], degrees))
             if p < FALSE_ALARM / len(names) and ratio > _ODD:
                 name = names[each[k]]
                 test = FactorTest(f"departure of {name}", _OTHERS, len(rows), float(chi2), len(rows), float(p))
                 rms = np.linalg.norm(a[k] - a[others[others != k]].mean(axis=0)) / 2  # as `rms_length`
                 found.append((name, ratio, rms, test))
     return sorted(found, key=lambda each: -each[1])
-
-
-def _beyond_chance(a, noise, degrees, alarm):
-    """Which of departures (n, k) are left out, the least probable first, until all others are alike, or half are left.
-
-    Several odd ones would hide behind one another.
-    """
-    out, left = [], np.arange(len(a))
-    while len(left) > max(_FEWEST - 1, len(a) / 2):
-        ratio, _, p = _compared(a[left], noise[left], degrees)
-        worst = np.lexsort([-ratio, p])[0]
-        if p[worst] >= alarm:
-            break
-        out.append(int(left[worst]))
-        left = np.delete(left, worst)
-    return out
-
-
-def _compared(a, noise, degrees):
-    """Departures (n, k), with variances of errors and degrees (k,), each by the others: ratio, chi2 and p, (n,)."""
-    n = len(a)
-    squares = (a - a.mean(axis=0)) ** 2
-    square, p = squares * (n / (n - 1)) ** 2, []  # from the mean of the others
-    for degree in (each := np.unique(degrees)):
-        of = degrees == degree
-        m = np.count_nonzero(of)
-        whole = (squares[:, of].sum() - squares[:, of].sum(axis=1) * n / (n - 1)) / (m * (n - 2))
-        errors = (noise[:, of].sum() - noise[:, of].sum(axis=1)) / (m * (n - 1))
-        scatter = np.maximum(whole - errors, 0)
-        square[:, of] /= (scatter + whole / (n - 1))[:, None] + noise[:, of]
-        p.append(special.fdtrc(m, m * (n - 2), square[:, of].mean(axis=1)))
-    return np.sqrt(square.mean(axis=1)), square.sum(axis=1), np.minimum(1, len(each) * np.min(p, axis=0))

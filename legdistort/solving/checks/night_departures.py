@@ -13,6 +13,7 @@ from functools import cache
 import numpy as np
 from scipy import sparse, special
 
+from ...geometry import basis
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees, row_variances
 from ...results.check import FALSE_ALARM
 from ...results.nights import NightsFound, NightStatic, NightTest
@@ -20,6 +21,7 @@ from ..knowledge.exposures import RANGE, ExposureModel
 from ..knowledge.factors import GIVEN, Factor
 from ..knowledge.posterior import Posterior, most_likely
 from ..knowledge.reduced_data import ReducedData, drawn, part_of
+from .odd_ones import beyond_chance, compared, with_others
 
 #: Times the scatter of the others and the errors, from which a departure is odd.
 ODD = 3.0
@@ -51,9 +53,15 @@ def found_nights(solution, problem, state, blocks):
     """
     night = np.broadcast_to(problem.night, problem.n_exposures)
     number = np.unique(night)
-    if solution.gauge.plane is not None or problem.degree < 1 or problem.unknowns.shared or len(number) < 2:
+    if solution.gauge.plane is not None or problem.degree < 1 or len(number) < 2:
         return NightsFound(tuple(NightTest() for _ in number))
     found = {n: [] for n in number}
+    if problem.unknowns.shared:
+        for detector in np.unique(problem.detectors):
+            each = np.flatnonzero(problem.detectors == detector)
+            for n, test in _of_residuals(solution, problem, blocks, each, night, FALSE_ALARM / len(number)).items():
+                found[n].append(test)
+        return NightsFound(tuple(map(_together, found.values())))
     rng = np.random.default_rng(0)
     for detector in np.unique(problem.detectors):
         each = np.flatnonzero(problem.detectors == detector)
@@ -73,6 +81,36 @@ def found_nights(solution, problem, state, blocks):
         return tuple(static for static in each if static is not None)
 
     return NightsFound(tuple(tests.values()), statics)
+
+
+def _of_residuals(solution, problem, blocks, each, night, alarm):
+    """The `NightTest` of nights where exposures of a detector (k,) have one distortion in common, ``{number: test}``.
+
+    A departure is in the residuals then: of every night these have a map of the shared modes in common. Errors in force
+    that were found from the residuals count as noise of this map, which the mean over a night makes small.
+    """
+    size, own = problem.n_modes, solution.gauge.n_own
+    rows, degrees = dynamic_basis(problem.shapes[each[0]], size), dynamic_degrees(size)
+    kept = degrees > basis.degree_of(own)
+    owners, a, noise = np.unique(night[each]), [], []
+    for n in owners:
+        of = np.isin(problem.exposure, each[night[each] == n])
+        modes, weight = blocks.values[:, of], problem.weight[:2, of]
+        design = np.concatenate([rows[kept].reshape(-1, 2, size)[:, axis] @ modes * np.sqrt(weight[axis])
+                                 for axis in range(2)], axis=1)  # fmt: skip
+        covariance = np.linalg.pinv(design @ design.T)
+        a.append(covariance @ design @ (np.sqrt(weight) * blocks.residual[:, of]).ravel())
+        noise.append(np.diag(covariance))
+    a, noise, degrees = np.array(a), np.array(noise), degrees[kept]
+    if len(owners) <= FEWEST or not len(degrees):
+        return {n: NightTest() for n in owners}
+    out, tests = beyond_chance(a, noise, degrees, alarm, fewest=FEWEST), {}
+    for k, n in enumerate(owners):
+        others = with_others(a, out, k)
+        ratio, chi2, p = (float(value[others == k][0]) for value in compared(a[others], noise[others], degrees))
+        departure = float(np.linalg.norm(a[k] - a[others[others != k]].mean(axis=0)) / 2)
+        tests[n] = NightTest(departure, ratio, chi2, len(degrees), p, bool(p < alarm and ratio > ODD))
+    return tests
 
 
 def _static(solution, problem, state, each):

@@ -19,7 +19,7 @@ from ...results.errors.header_pointing import CURE as POINTING_CURE
 from ..terms.observed import Observed
 from .camera_check import camera_check, contradicted_layout, undetermined
 from .cures import with_cures, without_static
-from .dynamic_check import dynamic_check, significance
+from .dynamic_check import dynamic_check, nights_check, significance
 from .limits import ALIKE, ASKED, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
 from .reference_check import reference_check
@@ -27,15 +27,15 @@ from .residual_tests import Residuals
 from .star_checks import overlaps_check, stars_check
 
 #: What else may be behind a check that does not pass.
-_CAUSES = dict.fromkeys(("time", "prior"), ("degree",)) | {"chi2": ("exposures", "place", "time", "degree")}
-_CAUSES |= dict.fromkeys(("exposures", "brightness", "place"), ("degree", "time"))
+_CAUSES = dict.fromkeys(("time", "prior"), ("degree",)) | {"chi2": ("exposures", "nights", "place", "time", "degree")}
+_CAUSES |= dict.fromkeys(("brightness", "place"), ("degree", "time")) | {"exposures": ("nights", "degree", "time")}
 _CAUSES["reference"] = "chi2", "degree", "time"
-_CAUSES["duplicates"] = "degree", "time", "place"
+_CAUSES["duplicates"] = "nights", "degree", "time", "place"
 #: In this order checks are told.
 _ORDER = (
-    "chi2", "exposures", "brightness", "place", "time", "degree", "dynamic part", "prior", "reference", "camera",
-    "absolute", "overlaps", "extrapolation", "rejection", "stars", "completeness", "duplicates", "header distortion",
-    "header pointing",
+    "chi2", "exposures", "brightness", "place", "time", "degree", "dynamic part", "nights", "prior", "reference",
+    "camera", "absolute", "overlaps", "extrapolation", "rejection", "stars", "completeness", "duplicates",
+    "header distortion", "header pointing",
 )  # fmt: skip
 #: What only residuals tell, and what to do where they tell nothing.
 _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degree, or add stars or exposures"
@@ -76,6 +76,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
         made, explained = with_cures(made, solution, residuals, observed, judged)
     others = (
         dynamic_check(solution, problem, blocks),
+        nights_check(solution, error=_star_error(residuals)),
         prior_check(solution, problem, state, error=_star_error(residuals)),
         reference_check(solution),
         camera_check(
