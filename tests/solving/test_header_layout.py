@@ -68,6 +68,20 @@ def test_it_does_not_matter_how_wrong_it_was(near, far, solution):
         assert abs(solution.camera[key].place.scale - 1) < 2e-3
 
 
+def test_what_nothing_determines_stays_as_headers_have_it():
+    """Detectors with distortions of their own are not turned for a map which exposures and detectors exchange."""
+    night, size = header_layouts.Night(12, off=0.3, n=6, n_stars=260, size=0.01), header_layouts.SIZE
+    bend = np.random.default_rng(12).normal(0, 1.0, (4, 2, 3))
+    for row in night.table:
+        u, v = (2 * row[axis] / (size - 1) - 1 for axis in "xy")
+        row["x"], row["y"] = (row["x"], row["y"]) + bend[int(row["detector"]) - 1] @ [u * u, u * v, v * v]
+    solution = legdistort.solve(legdistort.match(night.table, exposures=night.exposures), degree=2, static="fit")
+    assert solution.chi2 == pytest.approx(solution.dof, rel=0.1)
+    assert np.abs(solution.camera.headers.rotations).max() < 0.04
+    assert np.abs(solution.camera.headers.shifts).max() < 1.0
+    assert np.abs([solution.camera[key].place.scale - 1 for key in header_layouts.KEYS]).max() < 2e-4
+
+
 def test_held(near):
     """As exact: the stars do not agree with it, and that is said."""
     solution = legdistort.solve(near[1], layout="hold")
