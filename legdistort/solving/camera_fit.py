@@ -39,7 +39,9 @@ _LIES_IN = 0.3
 #: Layouts that agree so well [pix] are the same.
 _SAME = 1e-6
 #: Steps at most, and their length in standard errors at which they end.
-_STEPS, _SMALL = 10, 0.01
+_STEPS, _SMALL = 20, 0.01
+#: Part of a step by which the next one must take it back for half steps to be better.
+_BACK = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,12 +185,16 @@ class CameraFit:
             if not free.any() or (np.array_equal(free, sought.free) and np.isinf(sought.prior[free]).all()):
                 return matches
             sought = Sought(free, np.full(free.shape, np.inf))
+        part, last = 1.0, np.zeros(sought.free.shape)
         for _ in range(_STEPS):
             fit = self.join(estimate(matches))
             self.step = camera_step(fit, sought, self._departure, self._stated)
-            self._departure = self._departure + self.step.change
+            # exposures give way to a change that they can undo, and then it comes back: half of it does not
+            part = 0.5 if np.vdot(last, self.step.change) < -_BACK * np.vdot(last, last) else part
+            last = part * self.step.change
+            self._departure = self._departure + last
             try:
-                matches = in_camera(fit.matches, changed(fit.matches.camera, self.step.change))
+                matches = in_camera(fit.matches, changed(fit.matches.camera, last))
             except LegdistortError as error:  # it folds, or detectors leave the focal plane
                 raise SolveError(self._astray(matches, estimate, sought, error)) from None
             if self.step.length < _SMALL:
