@@ -7,6 +7,7 @@ import pytest
 
 import legdistort as ld
 from legdistort.cli import main
+from legdistort.cli.given_files import given_camera
 
 
 @pytest.fixture
@@ -26,6 +27,22 @@ def test_exposures_may_be_left_out_by_name(table, tmp_path, capsys):
     assert "2 exposures were left out: exp00, exp04: as asked (--without)" in check["sentence"]
     assert main([*line, str(tmp_path / "s"), "--without", "night*"]) == 1
     assert "--without night* is none of the exposures: exp00, exp01" in capsys.readouterr().err
+
+
+def test_a_solution_is_the_camera_that_it_found(tmp_path):
+    """In its folder, or by its file; the next solution begins with it."""
+    sim = ld.simulate_matches(n_exposures=4, n_stars=40, degree=2, sigma=0.02, dither=100.0)
+    solution = ld.solve(sim.matches, degree=2)
+    (tmp_path / "results").mkdir()
+    solution.write(tmp_path / "results" / "solution.asdf")
+    for given in ("results", "results/solution.asdf"):
+        camera = given_camera(str(tmp_path / given))
+        assert camera.detectors.keys() == solution.camera.detectors.keys()
+        for key, each in camera.detectors.items():
+            np.testing.assert_array_equal(each.static, solution.camera[key].static)
+            np.testing.assert_array_equal(each.layout, solution.camera[key].layout)
+    assert given_camera(None) is None
+    assert given_camera("gsaoi").name == "GSAOI"
 
 
 def test_cameras_and_priors_are_shown(tmp_path, capsys):

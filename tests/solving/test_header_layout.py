@@ -105,6 +105,14 @@ def test_what_is_known_little_of_poses_and_layouts_leads_nowhere_astray(bent, de
     assert np.abs(solution.camera.headers.shifts).max() < 1.0
 
 
+def test_detectors_together_keep_the_scale_of_headers(bent):
+    """However little is stated of them: what all have in common poses take up, and the stars tell nothing of it."""
+    solution = legdistort.solve(bent, degree=2, static="fit", layout_sigma={"shift": 20.0, "rotation": 0.5})
+    scales = [each.place.scale for each in solution.camera.detectors.values()]
+    assert np.mean(scales) == pytest.approx(1, abs=2e-4)
+    assert solution.chi2 == pytest.approx(solution.dof, rel=0.1)
+
+
 @pytest.mark.parametrize("name", ["pose_sigma", "layout_sigma"])
 def test_the_check_of_absolute_positions_names_what_cures_it(near, name):
     """Where headers may tell what stars do not; and with it the check passes."""
