@@ -377,8 +377,10 @@ def _where_to_begin(paths, earlier, measuring, **reading):
     usual = dict.fromkeys(reading) | vars(MeasureOptions())
     for name, value in (reading | vars(measuring)).items():
         if value is not usual[name] and value != usual[name]:
+            way = f"; or match {earlier}/detections.ecsv with it (legdistort match --camera) and solve these matches"
             raise InputError(
                 f"{name} is not to be given with an earlier run: that of {earlier} holds, or measure the frames again"
+                f"{way * (name == 'camera')}"
             )
     before = EarlierRun.read(earlier)
     return before.frames if paths is None else paths, before.reading | {"camera": before.camera}, before

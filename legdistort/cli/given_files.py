@@ -28,8 +28,11 @@ def read_given(path, a, contract=None):
 
 
 def given_camera(given):
-    """The camera of ``--camera``; None without one."""
-    return legdistort.Camera.gsaoi() if given == "gsaoi" else given and legdistort.Camera.read(given)
+    """The camera of ``--camera``: gsaoi, that of a file, or what a solution found, its file or folder; None without."""
+    if not given or given == "gsaoi":
+        return legdistort.Camera.gsaoi() if given else None
+    solved = Path(given).is_dir() or entry_of(given, ["legdistort"]) is not None
+    return legdistort.Solution.read(given).camera if solved else legdistort.Camera.read(given)
 
 
 def read_matches(a):

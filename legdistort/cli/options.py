@@ -231,7 +231,9 @@ INJECTING = {
 }
 CAMERA = {
     "camera": Option(
-        "of exposures with several detectors: a camera file, or gsaoi (default: by the headers)", metavar="CAMERA"
+        "of exposures with several detectors: a camera file, results that found one, or gsaoi (default: by "
+        "the headers)",
+        metavar="CAMERA",
     )
 }
 MATCHING = Group(

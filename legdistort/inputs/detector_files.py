@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry import epochs
-from .exposure_names import detector_name
+from .exposure_names import alike, detector_name
 from .file_images import KEYWORDS
 
 log = logging.getLogger(__name__)
@@ -148,17 +148,18 @@ def label_of(name, header, labels, *, exact):
     header : Header
     labels : iterable of str
     exact : bool
-        The label must have the whole name of the file but for the detector; else the beginning of it does.
+        The label must have the whole name of the file but for the detector; else the beginning of it does. Where none
+        has, one that differs from it by its last word is taken (`alike`).
     """
-    found = []
+    found, products = [], [alike(name, labels)]
     for key in filter(None, _named_in(header)):
-        whole = without_id(name, key)
-        for label in labels:
-            end = detector_name("", key)
-            first = label[: -len(end)] if label.lower().endswith(end.lower()) else ""
+        whole, end = without_id(name, key), detector_name("", key)
+        firsts = {each[: -len(end)]: each for each in labels if each.lower().endswith(end.lower())}
+        for first, label in firsts.items():
             if first and (first == whole or (name.startswith(first) and not exact)):
                 found.append((len(first), label))
-    return max(found, default=(0, None))[1]
+        products.append(firsts.get(alike(whole or "", firsts)))
+    return max(found)[1] if found else next(filter(None, products), None)
 
 
 def of_files(exposures, ids):

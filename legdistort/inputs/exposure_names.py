@@ -8,6 +8,7 @@ from ..exceptions import InputError
 _SUFFIX = re.compile(r"\.(fits|fit|fts|ldac|asdf)(\.(gz|fz|bz2|zip))?$", re.IGNORECASE)
 #: What no name has: slashes, control characters and line breaks, bytes of a file name that are no UTF-8.
 _UNFIT = re.compile("[/\\\\\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+_PRODUCT = re.compile(r"_[A-Za-z]{3,}$")
 _LONGEST = 250  # bytes; with the ending .asdf the 255 that file systems allow
 
 
@@ -16,6 +17,17 @@ def exposure_name(path, ext=None):
     name = _SUFFIX.sub("", Path(path).name)
     parts = ext if isinstance(ext, tuple) else (ext,)
     return name if ext is None else f"{name}_{''.join(map(str, parts))}"
+
+
+def alike(name, names):
+    """The only one of names that differs from a name by its last word; None if there is none, or several are so.
+
+    Pipelines call their products so, ``x_cal``, ``x_cat``, ``x_wcs``; the word is of letters, three at least, since
+    numbers and filters are those of other exposures.
+    """
+    stem = _PRODUCT.sub("", name)
+    found = [each for each in names if each != stem == _PRODUCT.sub("", each)] if stem != name else []
+    return found[0] if len(found) == 1 else None
 
 
 def detector_name(exposure, detector):

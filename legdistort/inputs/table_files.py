@@ -113,8 +113,7 @@ def named_after(table, exposures, path):
 def _frame_of(name, frames):
     """The longest name of a frame that a name begins with, or the only one that differs by its last word; or None."""
     begins = [frame for frame in frames if re.match(rf"{re.escape(frame)}(?![A-Za-z0-9])", str(name))]
-    alike = [frame for frame in frames if "_" in frame and frame.rpartition("_")[0] == str(name).rpartition("_")[0]]
-    return max(begins, key=len, default=alike[0] if len(alike) == 1 else None)
+    return max(begins, key=len, default=exposure_names.alike(str(name), frames))
 
 
 def _united(parts, path):

@@ -3,7 +3,9 @@
 A first matching in the focal plane finds the stars that stay on a detector; those that move over a gap are missed where
 the layout is wrong by more than the errors of the stars. Seen by each detector the stars are put on one plane, and what
 two detectors have in common there shows how these lie: a vote finds by how much one is shifted against the other, then
-all detectors are fitted together, each by an affine map. The camera is not changed: `legdistort.solve` finds that.
+all detectors are fitted together, each by an affine map. Where few stars cross from one detector to the next, the sets
+of detectors that are tied so far vote on one another, turned a little too. A star that crosses is no brighter there,
+and in no exposure on both. The camera is not changed: `legdistort.solve` finds that.
 """
 
 from dataclasses import dataclass
@@ -24,6 +26,11 @@ REACH, PART, WIDTH = 60.0, 1 / 8, 1.0
 RADII = (1.0, 3.0, 6.0)
 #: Logarithm of the odds against chance from which on a vote counts.
 ODDS = 6.0
+#: Rotations that are tried of detectors which are tied against others [rad], in steps that move a field of two
+#: detectors of 1000 pixels by the middle radius.
+TURNS = 0.003 * np.arange(-6, 7)
+#: Fluxes of a star on two detectors differ by no more than this, natural logarithm: their gains may.
+LIKE = 0.5
 #: Votes of so many pairs are counted; of more, every second, third, and so on is tried as the middle.
 _MOST = 5000
 #: Standard deviation of rotation, scale and shear of a detector beforehand.
@@ -56,7 +63,7 @@ def farthest(moves, detector):
     return seen[np.argmax(far)], far.max()
 
 
-def nearer(camera, xy, exposure, detector, star):
+def nearer(camera, xy, exposure, detector, star, flux=None):
     """Positions in the focal plane with the detectors where their stars put them.
 
     Parameters
@@ -66,27 +73,36 @@ def nearer(camera, xy, exposure, detector, star):
         Of detections in its focal plane, pixels.
     exposure, detector, star : ndarray of int, shape (n,)
         Detectors by their place in the camera; stars as far as they are known, -1 for none.
+    flux : ndarray, shape (n,), optional
 
     Returns
     -------
     ndarray, shape (n, 2), or None
         None where no two detectors see the same stars.
     """
-    arms = _arms(camera, xy, detector)
+    arms, bright = _arms(camera, xy, detector), np.full(len(xy), np.nan) if flux is None else _logarithm(flux)
     rows = np.isin(exposure, exposure[star >= 0])  # others have no pose
-    seen = _seen(camera, xy[rows], exposure[rows], detector[rows], star[rows], arms[rows])
+    seen = _seen(camera, *(each[rows] for each in (xy, exposure, detector, star, arms, bright)))
     sides = [max(each.shape) for each in camera.detectors.values()]
-    pairs = _voted(seen, min(REACH, PART * min(sides)))
-    if not len(pairs):
-        return None
-    joined = _joined(seen, pairs)
-    scale, change, slopes = RADII[-1] / 2, None, seen.slopes(len(sides))
-    for _ in range(_ROUNDS):
-        change, scale = _fitted(seen, slopes, pairs, scale)
-        pairs = _neighbours(seen, slopes @ change, joined, min(max(4 * scale, 0.5), RADII[-1]))
-        if len(pairs) < 2:
-            return None
-    return xy + np.einsum("nak,nk->na", change.reshape(-1, 2, 3)[detector], arms)
+    reach, slopes = min(REACH, PART * min(sides)), seen.slopes(len(sides))
+    change, joined, pairs = np.zeros(slopes.shape[2]), np.arange(seen.group.max() + 1), np.zeros((0, 2), dtype=int)
+    for turns in (np.zeros(1), *[TURNS] * len(sides)):  # detectors one by one, then those that are tied together
+        found = _voted(seen, seen.xy + slopes @ change, joined[seen.group], reach, turns)
+        if not len(found):
+            break
+        pairs, scale = np.concatenate([pairs, found]), RADII[-1] / 2
+        joined = _joined(seen, pairs)
+        for _ in range(_ROUNDS):
+            change, scale = _fitted(seen, slopes, pairs, scale)
+            pairs = _neighbours(seen, slopes @ change, joined, min(max(4 * scale, 0.5), RADII[-1]))
+            if len(pairs) < 2:
+                return None
+    return xy + np.einsum("nak,nk->na", change.reshape(-1, 2, 3)[detector], arms) if len(pairs) else None
+
+
+def _logarithm(flux):
+    """Natural logarithm of fluxes, NaN where there is none."""
+    return np.log(np.where(flux > 0, flux, np.nan))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +110,8 @@ class _Seen:
     """Stars as one detector sees them in exposures of one orientation.
 
     `xy` (n, 2) on a common plane, `detector`, `turned` and `group` (n,) of both: the orientation; `arms` (n, 3), and
-    how the plane follows the focal plane, `turn` (n, 2, 2).
+    how the plane follows the focal plane, `turn` (n, 2, 2); `bright` (n,) the logarithm of the flux, NaN for none, and
+    whether an exposure shows the star, `exposures` (n, n_exposures).
     """
 
     xy: np.ndarray
@@ -103,6 +120,15 @@ class _Seen:
     group: np.ndarray
     arms: np.ndarray
     turn: np.ndarray
+    bright: np.ndarray
+    exposures: np.ndarray
+
+    def can_be_one(self, pairs):
+        """Which pairs (n, 2) of rows may be one star: alike in flux, and in no exposure at once, bool (n,)."""
+        a, b = pairs.T
+        return ~(np.abs(self.bright[a] - self.bright[b]) > LIKE) & ~np.any(
+            self.exposures[a] & self.exposures[b], axis=1
+        )
 
     def slopes(self, n_detectors):
         """How stars move with affine maps of all detectors, and of the plane by orientation: (n, 2, n_maps, 2, 3)."""
@@ -124,7 +150,7 @@ def _arms(camera, xy, detector):
     return out
 
 
-def _seen(camera, xy, exposure, detector, star, arms):
+def _seen(camera, xy, exposure, detector, star, arms, bright):
     """The `_Seen`: means over exposures, the distortions of these relative to the mean fitted."""
     exposure, known = np.unique(exposure, return_inverse=True)[1], star >= 0
     tied = np.unique(star[known], return_inverse=True)[1]
@@ -153,38 +179,73 @@ def _seen(camera, xy, exposure, detector, star, arms):
     first = np.unique(node, return_index=True)[1]
     orientation = np.unique(turned[exposure[first]], return_inverse=True)[1]
     turn = mean(back).reshape(-1, 2, 2)
-    return _Seen(mean(on_plane), detector[first], orientation, group[first], mean(arms), turn)
+    shows = np.zeros((len(count), len(poses)), dtype=bool)
+    shows[node, exposure] = True
+    bright = mean(_at_one_level(bright, exposure, star)[:, None])[:, 0]
+    return _Seen(mean(on_plane), detector[first], orientation, group[first], mean(arms), turn, bright, shows)
 
 
-def _voted(seen, reach):
-    """Pairs (n, 2) of rows that are the same star by the votes of all groups that lie on each other within reach."""
+def _at_one_level(bright, exposure, star):
+    """Logarithms of fluxes (n,) with those of all exposures brought to one another by the stars in common."""
+    for _ in range(2):
+        level = np.bincount(star, bright)[star] / np.bincount(star)[star]
+        several = (np.bincount(star)[star] > 1) & np.isfinite(level)
+        apart = [np.median((bright - level)[several & (exposure == i)]) if np.any(several & (exposure == i)) else 0.0
+                 for i in range(exposure.max() + 1)]  # fmt: skip
+        bright = bright - np.array(apart)[exposure]
+    return bright
+
+
+def _voted(seen, xy, of_set, reach, turns):
+    """Pairs (n, 2) of rows that are the same star by the votes of all sets that lie on each other within reach.
+
+    Parameters
+    ----------
+    seen : _Seen
+    xy : ndarray, shape (n, 2)
+        Where its rows lie by now.
+    of_set : ndarray of int, shape (n,)
+        Number of the set of each: what lies in one is placed already.
+    reach : float
+        Pixels.
+    turns : ndarray, shape (k,)
+        Angles that are tried [rad].
+    """
     out = [np.zeros((0, 2), dtype=int)]
-    groups = [np.flatnonzero(seen.group == g) for g in range(seen.group.max() + 1)]
-    trees = [cKDTree(seen.xy[rows]) for rows in groups]
-    for g, h in combinations(range(len(groups)), 2):
+    sets = [np.flatnonzero(of_set == g) for g in np.unique(of_set)]
+    trees = [cKDTree(xy[rows]) for rows in sets]
+    for g, h in combinations(range(len(sets)), 2):
         near = trees[g].query_ball_tree(trees[h], reach)
         first = np.repeat(np.arange(len(near)), [len(each) for each in near])
         if len(first) < 2:
             continue
         second = np.concatenate([each for each in near if each]).astype(int)
-        pairs = np.stack([groups[g][first], groups[h][second]], axis=1)
-        agree = _vote(seen.xy[pairs[:, 1]] - seen.xy[pairs[:, 0]], reach)
+        pairs = np.stack([sets[g][first], sets[h][second]], axis=1)
+        pairs = pairs[seen.can_be_one(pairs)]
+        agree = _vote(xy[pairs[:, 0]], xy[pairs[:, 1]], reach, turns) if len(pairs) > 1 else None
         if agree is not None:
             out.append(pairs[agree])
     return np.concatenate(out)
 
 
-def _vote(shifts, reach):
-    """Which of shifts (n, 2) agree on one of them, beyond chance and near to none; None if they do not."""
-    tree, tried = cKDTree(shifts), shifts[:: len(shifts) // _MOST + 1]
-    far, best, found = np.log1p(np.sum(tried**2, axis=1) / WIDTH**2), ODDS, None
-    for radius in RADII:
-        votes, near = (tree.query_ball_point(tried, r, return_length=True) for r in (radius, 3 * radius))
-        expected = np.maximum(len(shifts) * (radius / reach) ** 2, (near - votes) / 8)
-        odds = np.where(votes > expected, votes * np.log(votes / expected) - votes + expected, 0) - far
-        k = int(np.argmax(odds))
-        if odds[k] > best and votes[k] > 1:
-            best, found = odds[k], tree.query_ball_point(tried[k], radius)
+def _vote(here, there, reach, turns):
+    """Which of pairs of positions (n, 2) agree on a shift and a turn, beyond chance and near to none; None if none do.
+
+    That is near: the odds are those of so much being wrong, by `WIDTH`, where a turn counts by the shift of its steps.
+    """
+    best, found = ODDS, None
+    for angle in turns:
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        shifts = (there - there.mean(axis=0)) @ turn + there.mean(axis=0) - here
+        tree, tried = cKDTree(shifts), shifts[:: len(shifts) // _MOST + 1]
+        far = np.log1p(np.sum(tried**2, axis=1) / WIDTH**2) + np.log1p(np.abs(angle) / _TURN)
+        for radius in RADII:
+            votes, near = (tree.query_ball_point(tried, r, return_length=True) for r in (radius, 3 * radius))
+            expected = np.maximum(len(shifts) * (radius / reach) ** 2, (near - votes) / 8)
+            odds = np.where(votes > expected, votes * np.log(votes / expected) - votes + expected, 0) - far
+            k = int(np.argmax(odds))
+            if odds[k] > best and votes[k] > 1 + (len(turns) > 1):  # a turn brings any two together
+                best, found = odds[k], tree.query_ball_point(tried[k], radius)
     return found
 
 

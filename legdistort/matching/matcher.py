@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy import units as u
+from astropy.table import vstack
 
+from ..cameras import ties
 from ..cameras.camera import Camera, check_camera
 from ..cameras.exchanged import check_places
 from ..cameras.focal_planes import focal_planes
@@ -95,8 +97,8 @@ def match(
         it, where stars cross from one detector to another. Where the layout is not exact (`Detector.layout_sigma`;
         that of headers is not), such stars are found though it is wrong by some ten pixels and tenths of a degree.
     min_exposures : int
-        A star is kept when it was found in that many exposures. Of a single exposure, which a reference catalogue may
-        solve, every detection is a star.
+        A star is kept when it was found in that many exposures; in two if no others tie some detectors of a camera.
+        Of a single exposure, which a reference catalogue may solve, every detection is a star.
     columns : dict, optional
         ``{name expected: name in the table}``.
     tolerance : float, optional
@@ -181,21 +183,25 @@ def match(
     names = list(dict.fromkeys(table["exposure"].tolist()) if named is None else named)
     _check_names(table, names, min_exposures)
     shapes = _shapes(table, names, named, shape)
+    edges = _at_edges(table, int(reject_flags))
     table = _without_repetitions(_without_flagged(table, int(reject_flags)))
     copies = _copies(table)
     table, names = table[~np.isin(table["exposure"], list(copies))], [name for name in names if name not in copies]
     headers = HeaderPoses.of((named or {}).values(), shapes, _known_starts(options.start, shapes))
 
     with parallel.one_blas_thread():  # matrices are small
-        label = _label_over_gaps if camera is not None and len(camera.detectors) > 1 and len(names) > 1 else _label
-        star, left_out = label(table, names, shapes, headers, options, camera)
+        if camera is not None and len(camera.detectors) > 1 and len(names) > 1:
+            star, left_out = _label_over_gaps(table, names, shapes, headers, options, camera, edges)
+        else:
+            star, left_out = _label(table, names, shapes, headers, options, camera)
     isolated = is_isolated(table, isolation)
     if not isolated.all():
         log.info("%d of %d detections are not isolated and left out", np.count_nonzero(~isolated), len(table))
         star[~isolated] = -1
     if camera is not None and len(names) > 1:
         _check_detectors(camera, table, star, shapes)
-    table, star = _keep_common(table, star, 1 if len(names) == 1 else min_exposures, left_out)
+    tying = None if camera is None or len(names) == 1 else _ties_of_few(camera, table, star, min_exposures)
+    table, star = _keep_common(table, star, 1 if len(names) == 1 else min_exposures, left_out, tying)
     epoch = mean_epoch(e.header for e in named.values()) if named else None
     _add_epochs(table, named or {})
     distortions = header_distortions(named[name] for name in np.unique(table["exposure"])) if named else {}
@@ -222,18 +228,21 @@ def _label(table, names, shapes, headers, options, camera=None):
     return star, left_out
 
 
-def _label_over_gaps(table, names, shapes, headers, options, camera):
+def _label_over_gaps(table, names, shapes, headers, options, camera, edges):
     """The same in the layout which the stars call for: labels, with a warning where that of the camera is exact.
 
     It is sought anew with the stars that were found, as long as more detections become the same star; of an exact one
-    by more than chance.
+    by more than chance. Stars that cross are at the `edges`: a table of detections for this search alone.
     """
     keys, free = list(camera.detectors), detector_places.is_free(camera)
-    detector = np.array([keys.index(key) for key in camera.ids(table)])
-    exposure, moved = np.unique(table["exposure"], return_inverse=True)[1], table.copy()
-    found, given = _label(table, names, shapes, headers, options), _positions(table)
+    rows, moved = len(table), vstack([table, edges[np.isin(edges["exposure"], names)]], metadata_conflicts="silent")
+    detector = np.array([keys.index(key) for key in camera.ids(moved)])
+    exposure, given = np.unique(moved["exposure"], return_inverse=True)[1], _positions(moved)
+    flux = column_contract.values(moved, "flux") if "flux" in moved.colnames else None
+    found, alone = _label(table, names, shapes, headers, options), np.full(len(moved) - rows, -1)
     for _ in range(_MOST_PLACINGS):
-        xy = detector_places.nearer(camera, _positions(moved), exposure, detector, found[0])
+        star = np.concatenate([found[0], alone])
+        xy = detector_places.nearer(camera, _positions(moved), exposure, detector, star, flux)
         if xy is None:
             break
         c, far = detector_places.farthest(xy - given, detector)
@@ -241,7 +250,7 @@ def _label_over_gaps(table, names, shapes, headers, options, camera):
             break
         moved["x"], moved["y"] = xy.T * u.pix
         try:
-            again = _label(moved, names, shapes, headers, options)
+            again = _label(moved[:rows], names, shapes, headers, options)
         except MatchError:
             break
         gained = detector_places.n_tied(again[0]) - detector_places.n_tied(found[0])
@@ -310,6 +319,14 @@ def _without_flagged(table, reject_flags):
             "correct the column flags or leave it out, or give the bits to reject, match(reject_flags=...), 0 for none"
         )
     return table[good]
+
+
+def _at_edges(table, reject_flags):
+    """Detections at the edge of an image that are rejected for no other reason."""
+    if "flags" not in table.colnames:
+        return table[:0]
+    flags = np.nan_to_num(np.clip(table["flags"], 0, LARGEST_FLAGS)).astype(int)
+    return table[(flags & reject_flags) == Flag.EDGE]
 
 
 def _without_repetitions(table):
@@ -415,12 +432,29 @@ def _check_groups(groups, lists, names, left_out):
         )
 
 
-def _keep_common(table, star, min_exposures, left_out):
-    """Rows of stars in enough exposures; exposures with fewer than 3 of these go, and with them their rows."""
+def _ties_of_few(camera, table, star, min_exposures):
+    """Rows (n,) of stars on detectors that stars in enough exposures do not tie, bool: fewer are enough for them."""
+    labelled = table["exposure", "detector"].copy()
+    labelled["star"] = star
+    number, inverse, count = np.unique(star, return_inverse=True, return_counts=True)
+    seen = ties.seen_by(camera, labelled) & (number >= 0) & (count > 1)
+    group = ties.believed(seen & (count >= min_exposures))
+    tying = sum(seen[group == g].any(axis=0).astype(int) for g in range(group.max(initial=-1) + 1)) > 1
+    few = int(np.count_nonzero(tying & (count < min_exposures)))
+    if few:
+        log.info(
+            "%d star%s in fewer than %d exposures kept: how detectors lie to each other rests on %s",
+            few, "s" * (few > 1), min_exposures, "them" if few > 1 else "it",
+        )  # fmt: skip
+    return tying[inverse]
+
+
+def _keep_common(table, star, min_exposures, left_out, tying=None):
+    """Rows of stars in enough exposures, or of those `tying` detectors; exposures with fewer than 3 of these go too."""
     exposure = np.asarray(table["exposure"])
     while True:
         _, inverse, count = np.unique(star, return_inverse=True, return_counts=True)
-        keep = (star >= 0) & (count[inverse] >= min_exposures)
+        keep = (star >= 0) & (count[inverse] >= (min_exposures if tying is None else np.where(tying, 2, min_exposures)))
         seen = np.unique(exposure[keep], return_counts=True)
         poor = {str(n): c for n, c in zip(*seen, strict=True) if c < 3}
         absent = [n for n in np.unique(exposure) if n not in seen[0] and n not in left_out]

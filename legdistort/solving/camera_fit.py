@@ -31,10 +31,17 @@ _TOLD = 0.1
 #: Weights of a change of a layout, its shift and the rest, beside that of a static distortion, where a map can be put
 #: into either: shifts are the least known.
 _SHIFT_WEIGHT, _LAYOUT_WEIGHT = 0.003, 0.03
+#: The same where headers have a detector where it lies, as far as the stars tell: shifts are right to 3 px, the rest to
+#: 0.1 px (of 2048 pixels 0.01 degrees), and the static distortions of unknown optics are 1 px.
+_STATED_SHIFT, _STATED_LAYOUT = 0.1, 10.0
 #: Part of a direction that may be left of it where it counts as one of several.
 _LIES_IN = 0.3
+#: Layouts that agree so well [pix] are the same.
+_SAME = 1e-6
 #: Steps at most, and their length in standard errors at which they end.
-_STEPS, _SMALL = 10, 0.01
+_STEPS, _SMALL = 20, 0.01
+#: Part of a step by which the next one must take it back for half steps to be better.
+_BACK = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +170,7 @@ class CameraFit:
 
     def __init__(self, sought, join=None):
         self.sought, self.step, self._departure = sought, None, np.zeros(sought.free.shape)
+        self._stated = np.zeros(len(sought.free), dtype=bool)
         self.join = join or (lambda fit: fit)
 
     def settle(self, matches, estimate, *, layout_alone=False):
@@ -171,22 +179,28 @@ class CameraFit:
         With its `layout_alone`, of which nothing is known, for a beginning: where that is wrong by tens of pixels,
         static distortions, and maps that only widths determine, would take up what is of it, and lead astray.
         """
-        sought = self.sought
+        sought, given = self.sought, matches.camera
         if layout_alone:
             free = sought.free & (np.arange(sought.free.shape[2]) < 3)
             if not free.any() or (np.array_equal(free, sought.free) and np.isinf(sought.prior[free]).all()):
                 return matches
             sought = Sought(free, np.full(free.shape, np.inf))
+        part, last = 1.0, np.zeros(sought.free.shape)
         for _ in range(_STEPS):
             fit = self.join(estimate(matches))
-            self.step = camera_step(fit, sought, self._departure)
-            self._departure = self._departure + self.step.change
+            self.step = camera_step(fit, sought, self._departure, self._stated)
+            # exposures give way to a change that they can undo, and then it comes back: half of it does not
+            part = 0.5 if np.vdot(last, self.step.change) < -_BACK * np.vdot(last, last) else part
+            last = part * self.step.change
+            self._departure = self._departure + last
             try:
-                matches = in_camera(fit.matches, changed(fit.matches.camera, self.step.change))
+                matches = in_camera(fit.matches, changed(fit.matches.camera, last))
             except LegdistortError as error:  # it folds, or detectors leave the focal plane
                 raise SolveError(self._astray(matches, estimate, sought, error)) from None
             if self.step.length < _SMALL:
                 break
+        if layout_alone:
+            self._stated = _confirmed(given, matches.camera)
         return matches
 
     def _astray(self, matches, estimate, sought, error):
@@ -198,8 +212,7 @@ class CameraFit:
             return f"{words}; lower the degree, or give a camera that is nearer to the right one (camera=, --camera)"
         free = np.broadcast_to(np.arange(sought.free.shape[2]) < 3, sought.free.shape)
         found = CameraFit(Sought(free, np.full(free.shape, np.inf)), self.join).settle(matches, estimate).camera
-        beside = {k: replace(each, header_layout=camera[k].layout) for k, each in found.detectors.items()}
-        layout = replace(found, detectors=beside).headers
+        layout = _beside({key: each.layout for key, each in camera.detectors.items()}, found)
         odd = [f"{layout.names[k]} lies {np.hypot(*layout.shifts[k]):.0f} px" for k in np.flatnonzero(~layout.agree)]
         odd = f"detector {', '.join(odd)}" if odd else f"detectors lie up to {layout.scatter:.2g} px"
         return (
@@ -250,6 +263,25 @@ class CameraFit:
         return Departure(len(sigma), float(chi2), float(np.count_nonzero(told)), list(camera.detectors)[most])
 
 
+def _beside(stated, found):
+    """The `HeaderLayout` of stated layouts (2, 3) of the detectors of a camera beside where they were found."""
+    exact = {"layout_sigma": None, "layout_covariance": None}
+    each = {k: replace(found[k], header_layout=layout, **exact) for k, layout in stated.items()}
+    return replace(found, detectors=each).headers
+
+
+def _confirmed(given, found):
+    """Detectors (n_detectors,) that began, and lie, where their headers have them, bool.
+
+    A camera file knows static distortions too, and these better than where its detectors lie if that is sought.
+    """
+    stated = {key: each.header_layout for key, each in given.detectors.items()}
+    layout = None if any(each is None for each in stated.values()) else _beside(stated, found)
+    if layout is None or layout.is_undecided or _beside(stated, given).scatter > _SAME:
+        return np.zeros(len(stated), dtype=bool)
+    return layout.agree
+
+
 def _errors(fit, step, unknown):
     """The `CameraErrors` of a step; `unknown` (m, k) are the directions of the camera that nothing determines."""
     good, gauge = fit.blocks.v[0] > 0, fit.result.gauge
@@ -296,12 +328,15 @@ def _unknown(camera, step):
     return out / np.sqrt(np.mean(out**2, axis=1, keepdims=True))
 
 
-def _exchanged(camera, free):
-    """Changes (m, k) of the free modes of all detectors by common maps of the focal plane, which exposures can undo."""
-    modes = free.any(axis=(0, 1))
+def _exchanged(camera, free, degree=None):
+    """Changes (m, k) of the free modes of all detectors by common maps of the focal plane, which exposures can undo.
+
+    Of a `degree`, or of that of the free modes.
+    """
+    modes, out = free.any(axis=(0, 1)), []
     if not modes[:3].all():
         return np.zeros((0, np.count_nonzero(free)))
-    degree, out = basis.degree_of(np.count_nonzero(modes)), []
+    degree = basis.degree_of(np.count_nonzero(modes)) if degree is None else degree
     for axis in (0, 1):
         for mode in range(basis.n_modes(degree)):
             change = np.zeros(free.shape)
@@ -355,7 +390,7 @@ def in_camera(matches, camera):
     return replace(matches, table=table, camera=camera)
 
 
-def camera_step(fit, sought, departure):
+def camera_step(fit, sought, departure, stated=False):
     """The `CameraStep` that a `Fit` calls for.
 
     Parameters
@@ -364,18 +399,21 @@ def camera_step(fit, sought, departure):
     sought : Sought
     departure : ndarray, shape (n_detectors, 2, n_modes)
         Of the camera from where it was beforehand.
+    stated : ndarray of bool, shape (n_detectors,)
+        Those whose headers nothing contradicts: what is not determined of them stays as these state it.
     """
     free, prior = sought.free, sought.prior
     patterns = _patterns(fit.matches, fit.matches.camera, fit.weighted, free)
     follow = followed(response(fit.uncertainty.system, fit.result.gauge), fit.weighted, fit.blocks, patterns)
     precision = 1 / prior[free] ** 2
-    pull = follow.pull - precision * departure[free]
-    covariance, weak = _inverse(follow.normal, precision, follow.alone)
-    held = _held(weak, np.nonzero(free)[2], _slides(fit, free, weak))
+    normal, pull = _told(fit, follow, free)
+    pull = pull - precision * departure[free]
+    covariance, weak = _inverse(normal, precision, follow.alone)
+    held = _held(weak, _weights(free, stated), _slides(fit, free, weak))
     change = np.zeros(free.shape)
     change[free] = held @ (departure[free] + covariance @ pull) - departure[free]
     covariance = held @ covariance @ held.T
-    freedom = float(np.sum(covariance * follow.normal))
+    freedom = float(np.sum(covariance * normal))
     return CameraStep(change, covariance, free, follow.stars[:2], follow.coefficients, freedom, weak)
 
 
@@ -390,6 +428,23 @@ def _patterns(matches, camera, problem, free):
         moved = moved_by(chip, chip.distortion.invert(xy[rows]), units[:, :, free[c].ravel()])
         out[np.ix_([True, True], rows, of_detector == c)] = moved.transpose(1, 0, 2)
     return out
+
+
+def _told(fit, follow, free):
+    """Normal matrix (k, k) and gradient (k,) of what the data tell: nothing of an affine map that all detectors share.
+
+    Poses and exposures take it up exactly. What is left of it is the error of the linearisation, which widths
+    beforehand would be weighed against: a common scale went off by 4 %.
+    """
+    camera = fit.matches.camera
+    seen = np.isin(list(camera.detectors), camera.ids(fit.matches.table))
+    if fit.result.gauge.poses_known or not free[seen][:, :, :3].all():
+        return follow.normal, follow.pull
+    unit = 1 / np.sqrt(follow.alone)
+    common = np.linalg.qr((_exchanged(camera, free, 1) / unit).T)[0]
+    left = np.eye(len(unit)) - common @ common.T
+    scaled = left @ (follow.normal * np.outer(unit, unit)) @ left
+    return scaled / np.outer(unit, unit), left @ (unit * follow.pull) / unit
 
 
 def _inverse(normal, precision, alone):
@@ -424,23 +479,31 @@ def _slides(fit, free, weak):
     return rows[(left < _LIES_IN * np.linalg.norm(moves, axis=1)) & (len(groups) > 1)]
 
 
-def _held(weak, modes, slides):
-    """What takes directions (m, k) that are not determined off a change of the camera, (k, k).
+def _weights(free, stated):
+    """Weights (k,) of the free modes: what of them is not determined stays where it was, the more the larger.
 
-    Static distortions stay as they were, as far as that holds these directions, and layouts as far as it does not:
-    layouts may be wrong by many pixels, and to shift detectors against one another is not to bend the focal plane.
+    Static distortions before layouts, which may be wrong by many pixels, and to shift detectors against one another is
+    not to bend the focal plane; but layouts that were `stated` (n_detectors,) and not contradicted before these.
+    """
+    detector, _, mode = np.nonzero(free)
+    near = np.broadcast_to(stated, len(free))[detector]
+    shift, rest = np.where(near, _STATED_SHIFT, _SHIFT_WEIGHT), np.where(near, _STATED_LAYOUT, _LAYOUT_WEIGHT)
+    return np.select([mode == 0, mode < 3], [shift, rest], 1.0)
+
+
+def _held(weak, weights, slides):
+    """What takes directions (m, k) that are not determined off a change of the camera, (k, k).
 
     Parameters
     ----------
     weak : ndarray, shape (m, k)
-    modes : ndarray of int, shape (k,)
-        That each unknown belongs to.
+    weights : ndarray, shape (k,)
+        How much of each unknown stays as it was.
     slides : ndarray, shape (m, k)
         Those of `_slides`: groups that no star ties to each other stay where they were, as far as that can be.
     """
-    weights = np.diag(np.select([modes == 0, modes < 3], [_SHIFT_WEIGHT, _LAYOUT_WEIGHT], 1.0))
-    weights = np.concatenate([weights, slides])
-    return np.eye(len(modes)) - weak.T @ np.linalg.pinv(weights @ weak.T) @ weights
+    weights = np.concatenate([np.diag(weights), slides])
+    return np.eye(len(weights.T)) - weak.T @ np.linalg.pinv(weights @ weak.T) @ weights
 
 
 def changed(camera, change):

@@ -395,8 +395,10 @@ def _in_camera(matches, options, sought, join):
     """What `_fitted` gives, all ties of detectors believed."""
     camera, selection = None if sought is None else CameraFit(sought, join), None
     if camera is not None:  # to a layout that is wrong by pixels all observations seem to deviate
-        plain = partial(single_fit.estimate, options=_plain(options))
-        matches = camera.settle(camera.settle(matches, plain, layout_alone=True), plain)
+        plain, known = partial(single_fit.estimate, options=_plain(options)), matches.pose_sigma
+        anywhere = replace(matches, pose_sigma=None)  # what is wrong of the layout would turn the plane
+        matches = camera.settle(camera.settle(anywhere, plain, layout_alone=True), plain)
+        matches = replace(matches, pose_sigma=known)
     if options.chooses_degree:
         selection = _choose_degree(
             replace(matches, pose_sigma=None), options

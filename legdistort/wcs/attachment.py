@@ -99,8 +99,9 @@ def attach(
     that: plates of scans (DSS: ``PLTRAH``, ``AMDX1``, ``XPIXELSZ`` ...), polynomials of IRAF and wcstools. The errors
     hold for the header as it stands in the file. Nothing is written unless everything can be.
 
-    Frames are identified by their names, as `read_exposures` gives them. A frame that was left out of the solution is
-    skipped, which is logged.
+    Frames are identified by their names, as `read_exposures` gives them; where none is so called, by these but for the
+    last word, as products of pipelines differ (``x_cal``, ``x_wcs``), which is logged. A frame that was left out of the
+    solution is skipped, which is logged.
 
     Parameters
     ----------
@@ -156,6 +157,10 @@ def attach(
         )
     if unknown := _unknown_sky(solution):
         log.warning("%s", unknown)
+    if alike := [f"{plan.path.name} as {v.name}" for plan in plans for v in map(images.views.get, plan.headers)
+                 if _is_another_product(plan.path, v)]:  # fmt: skip
+        log.warning("frames are taken for exposures whose names differ by the last word (%d): %s", len(alike),
+                    some_of(alike, 3))  # fmt: skip
     if kind != "head" and not in_place and (maps := [m for plan in plans if (m := WeightMaps().beside(plan.path))]):
         log.warning(
             "weight maps stay where they are (%s): SWarp looks for them beside the copies; copy or link them into %s",
@@ -168,6 +173,13 @@ def attach(
             with writing(plan.target) as file:
                 plan.write(file)
     return [Attachment(plan.target, *item, kind) for plan in plans for item in plan.headers.items()]
+
+
+def _is_another_product(path, view):
+    """Whether a frame is another product of a pipeline than the exposure is called for (`exposure_names.alike`)."""
+    name = exposure_names.exposure_name(path)
+    whole = name if view.detector is None else detector_files.without_id(name, view.detector) or name
+    return whole != view.name == exposure_names.alike(whole, [view.name])
 
 
 def _unknown_sky(solution):

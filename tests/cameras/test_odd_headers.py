@@ -180,6 +180,26 @@ def test_a_layout_that_is_held_and_wrong_is_the_cause(matches):
     assert {check.cure for check in wrong} == {"see camera first, which is the cause"}
 
 
+@pytest.mark.parametrize("seed", [40, 61])
+@pytest.mark.parametrize("odd", [(22.0, -24.0, 0.0), (0.0, 0.0, 0.0)])
+def test_a_star_or_two_show_it(seed, odd):
+    """If all that cross are far off; and what is held, or stated, is then not named as a cure of the few ties."""
+    night = header_layouts.Night(seed, off=0.1, dither=36.0, n=6, n_stars=260, odd=odd, size=0.05)
+    table = night.table.copy()
+    table.rename_column("true", "star")
+    star, detector = np.asarray(table["star"]), np.asarray(table["detector"])
+    crossing = [s for s in np.unique(star) if "3" in set(detector[star == s]) and len(set(detector[star == s])) > 1]
+    table = table[(np.bincount(star)[star] > 1) & ~np.isin(star, crossing[1:])]
+    matches = ld.Matches.from_table(table, camera=ld.Camera.of_frames(night.exposures))
+    with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        held, found = ({c.name: c for c in ld.solve(matches, layout=how).checks}["camera"] for how in ("hold", "fit"))
+    assert (held.state == "fail") == any(odd)
+    assert ("--layout fit instead of --layout hold" in held.cure) == any(odd)
+    assert held.value == (pytest.approx(np.hypot(*odd[:2]), abs=2) if any(odd) else None)
+    assert "(--reference)" in found.cure
+    assert ("--layout hold" not in found.cure) == any(odd)
+
+
 def test_static_distortions_cannot_make_up_for_it(matches, monkeypatch):
     """Where they fold in the attempt, it is said what they could not make up for."""
     in_camera, calls = camera_fit.in_camera, []

@@ -9,6 +9,7 @@ from night_sets import SIZE, Nights
 
 import legdistort as ld
 from legdistort.cli import main
+from legdistort.cli.given_files import given_camera
 
 
 @pytest.fixture
@@ -80,6 +81,22 @@ def test_a_stated_pixel_scale_gives_figures_in_mas(tmp_path, capsys):
     words = f"at 0.01 arcsec a pixel: residuals {found['rms_mas']:.3g} mas rms per axis"
     assert f"angles {words}" in printed
     assert words in (tmp_path / "angles" / "report.html").read_text()
+
+
+def test_a_solution_is_the_camera_that_it_found(tmp_path):
+    """In its folder, or by its file; the next solution begins with it."""
+    sim = ld.simulate_matches(n_exposures=4, n_stars=40, degree=2, sigma=0.02, dither=100.0)
+    solution = ld.solve(sim.matches, degree=2)
+    (tmp_path / "results").mkdir()
+    solution.write(tmp_path / "results" / "solution.asdf")
+    for given in ("results", "results/solution.asdf"):
+        camera = given_camera(str(tmp_path / given))
+        assert camera.detectors.keys() == solution.camera.detectors.keys()
+        for key, each in camera.detectors.items():
+            np.testing.assert_array_equal(each.static, solution.camera[key].static)
+            np.testing.assert_array_equal(each.layout, solution.camera[key].layout)
+    assert given_camera(None) is None
+    assert given_camera("gsaoi").name == "GSAOI"
 
 
 def test_cameras_and_priors_are_shown(tmp_path, capsys):

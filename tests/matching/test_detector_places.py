@@ -9,6 +9,7 @@ import pytest
 import legdistort
 from legdistort.exceptions import AssumptionWarning
 from legdistort.matching import detector_places
+from legdistort.measurement.flags import Flag
 
 
 def matched(night, **known):
@@ -22,6 +23,34 @@ def test_stars_cross(seed, off, turn, rolls):
     true, found = night.crossing(3), night.found(matched(night))
     assert len(true) > 20
     assert len(true & found) >= 0.98 * len(true)
+
+
+@pytest.mark.parametrize(("seed", "few"), [(45, 5), (53, 6)])
+def test_few_stars_that_cross_tie_detectors(seed, few):
+    """In fewer exposures than are asked for, some flagged at an edge, and with a header that is far off."""
+    night = header_layouts.Night(seed, off=1.0, turn=0.05, dither=36.0, n=6, n_stars=260, odd=(22.0, -24.0, 0.6))
+    table, last = night.table, header_layouts.SIZE - 1
+    x, y = table["x"], table["y"]
+    table["flags"] = np.where((np.minimum(x, y) < 3) | (np.maximum(x, y) > last - 3), int(Flag.EDGE), 0)
+    matches = legdistort.match(table, exposures=night.exposures, min_exposures=4)
+    assert len(matches.camera.groups(matches.table)) == 1
+    found, true = night.found(matches), np.asarray(matches.table["true"])
+    assert len(found) >= few
+    assert min(np.count_nonzero(true == star) for star in found) < 4
+    assert not np.any(matches.table["flags"])
+    rest = np.isin(true, list(found), invert=True)
+    assert np.unique(true[rest], return_counts=True)[1].min() == 4
+
+
+@pytest.mark.parametrize("fluxes", [True, False])
+def test_chance_ties_no_detectors(fluxes):
+    night = header_layouts.Night(7, off=3.0, dither=9.0, n=5, n_stars=800, odd=(22.0, -24.0, 0.6))
+    assert not night.crossing(1)
+    if not fluxes:
+        night.table.remove_column("flux")
+    matches = legdistort.match(night.table, exposures=night.exposures)
+    assert not night.found(matches)
+    assert len(matches.camera.groups(matches.table)) == 4
 
 
 def test_an_exact_layout_that_is_wrong_is_named():

@@ -94,6 +94,10 @@ def test_files_of_two_runs_are_refused(night, tmp_path, name):
         ({"psf": "moffat"}, "psf is not to be given with an earlier run"),
         ({"measuring": {"threshold": 4}}, "threshold is not to be given with an earlier run"),
         ({"ext": 1}, "ext is not to be given with an earlier run"),
+        (
+            {"camera": legdistort.Camera.gsaoi()},
+            r"or match \S*first/detections.ecsv with it .legdistort match --camera",
+        ),
         ({"earlier": "frames"}, "frames has no detections.ecsv: give the folder of the results of a run"),
         ({"earlier": None}, "give frames, or the folder of an earlier run"),
         ({"paths": ["frames/exp00.fits", "frames/other.fits"]}, "other.fits was not measured in .*first, whose frames"),

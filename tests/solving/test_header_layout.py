@@ -68,6 +68,63 @@ def test_it_does_not_matter_how_wrong_it_was(near, far, solution):
         assert abs(solution.camera[key].place.scale - 1) < 2e-3
 
 
+@pytest.fixture(scope="module")
+def bent():
+    """Matches of a night whose detectors have distortions of their own, of 1 px a term, and headers that are right."""
+    night, size = header_layouts.Night(12, off=0.3, n=6, n_stars=260, size=0.01), header_layouts.SIZE
+    bend = np.random.default_rng(12).normal(0, 1.0, (4, 2, 3))
+    for row in night.table:
+        u, v = (2 * row[axis] / (size - 1) - 1 for axis in "xy")
+        row["x"], row["y"] = (row["x"], row["y"]) + bend[int(row["detector"]) - 1] @ [u * u, u * v, v * v]
+    return legdistort.match(night.table, exposures=night.exposures)
+
+
+def test_what_nothing_determines_stays_as_headers_have_it(bent):
+    """Detectors with distortions of their own are not turned for a map which exposures and detectors exchange."""
+    solution = legdistort.solve(bent, degree=2, static="fit")
+    assert solution.chi2 == pytest.approx(solution.dof, rel=0.1)
+    assert np.abs(solution.camera.headers.rotations).max() < 0.04
+    assert np.abs(solution.camera.headers.shifts).max() < 1.0
+    assert np.abs([solution.camera[key].place.scale - 1 for key in header_layouts.KEYS]).max() < 2e-4
+
+
+@pytest.mark.parametrize(
+    ("degree", "stated"),
+    [
+        (2, {"pose_sigma": {"shift": 3.0, "rotation": 0.003}}),
+        (2, {"pose_sigma": {"shift": 3.0, "rotation": 0.05}}),
+        (3, {"layout_sigma": {"shift": 1.0, "rotation": 0.02}}),
+    ],
+)
+def test_what_is_known_little_of_poses_and_layouts_leads_nowhere_astray(bent, degree, stated):
+    """It determines what stars do not, and the camera is found as without it."""
+    solution = legdistort.solve(bent, degree=degree, static="fit", **stated)
+    assert solution.status.startswith("converged")
+    assert "static distortions not" not in solution.status
+    assert solution.chi2 == pytest.approx(solution.dof, rel=0.1)
+    assert np.abs(solution.camera.headers.shifts).max() < 1.0
+
+
+def test_detectors_together_keep_the_scale_of_headers(bent):
+    """However little is stated of them: what all have in common poses take up, and the stars tell nothing of it."""
+    solution = legdistort.solve(bent, degree=2, static="fit", layout_sigma={"shift": 20.0, "rotation": 0.5})
+    scales = [each.place.scale for each in solution.camera.detectors.values()]
+    assert np.mean(scales) == pytest.approx(1, abs=2e-4)
+    assert solution.chi2 == pytest.approx(solution.dof, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["pose_sigma", "layout_sigma"])
+def test_the_check_of_absolute_positions_names_what_cures_it(near, name):
+    """Where headers may tell what stars do not; and with it the check passes."""
+    before, after = (
+        next(check for check in legdistort.solve(near[1], **known).checks if check.name == "absolute")
+        for known in ({}, {name: {"shift": 4.0, "rotation": 0.01}})
+    )
+    assert before.state == "unknown"
+    assert f"--{name.replace('_', '-')} shift=PIXELS,rotation=DEGREES" in before.cure
+    assert after.state == "pass"
+
+
 def test_held(near):
     """As exact: the stars do not agree with it, and that is said."""
     solution = legdistort.solve(near[1], layout="hold")

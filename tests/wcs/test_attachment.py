@@ -28,6 +28,7 @@ from legdistort.cli.parser import main
 from legdistort.exceptions import DiskFullError, ExportError, InputError
 from legdistort.geometry import similarity
 from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.inputs import detector_files
 from legdistort.results.solution import Solution
 from legdistort.runtime.fits_bytes import locate
 from legdistort.simulation.observations import simulate_matches
@@ -389,6 +390,30 @@ def test_a_frame_under_another_name(one, frame, tmp_path):
     attach(one, tmp_path / "other.fits", in_place=True)
     assert names_in(tmp_path / "other.fits").count("ASDF") == 1
     assert_allclose(wcs_in(tmp_path / "other.fits")(3.0, 4.0), one["other"].wcs(3.0, 4.0), rtol=0, atol=1e-12)
+
+
+def test_another_product_of_a_pipeline_is_the_same_exposure(geometry, tmp_path, caplog):
+    """By the names but for the last word, if only one exposure is so called; and it is said."""
+    solution = geometry(1, 2.0, shape=SHAPE, names=("frame_00001_wcs", "frame_00002_wcs"))
+    second = write_frame(tmp_path / "frame_00002_cal.fits")
+    attach(solution, second, in_place=True)
+    assert_allclose(wcs_in(second)(3.0, 4.0), solution["frame_00002_wcs"].wcs(3.0, 4.0), rtol=0, atol=1e-12)
+    assert "whose names differ by the last word (1): frame_00002_cal.fits as frame_00002_wcs" in caplog.text
+    both = geometry(1, 2.0, shape=SHAPE, names=("frame_00002_wcs", "frame_00002_cat"))
+    (tmp_path / "again").mkdir()
+    for known, name in ((both, "frame_00002_cal"), (solution, "frame_00003_cal"), (solution, "frame_00001_J")):
+        with pytest.raises(InputError, match="in the solution"):
+            attach(known, write_frame(tmp_path / "again" / f"{name}.fits"), out=tmp_path / "out", overwrite=True)
+
+
+def test_so_is_that_of_a_detector_of_a_camera():
+    labels = [f"x_{k}_wcs-{d}" for k in ("00001", "00002") for d in ("NRCA1", "NRCA2")]
+    header = fits.Header({"DETECTOR": "NRCA2"})
+    assert detector_files.label_of("x_00002_nrca2_cal", header, labels, exact=False) == "x_00002_wcs-NRCA2"
+    assert detector_files.label_of("x_00003_nrca2_cal", header, labels, exact=False) is None
+    assert detector_files.label_of("x_00002_nrca2_cal", header, ["x_00002_cal-NRCA2", *labels], exact=False) == (
+        "x_00002_cal-NRCA2"
+    )
 
 
 def test_names_beyond_ascii(geometry, tmp_path):

@@ -19,9 +19,11 @@ _SAME = 1e-6
 _MOST_COLUMNS, _MOST_VALUES = 1000, 30_000_000
 _TIE = (
     "more stars that dithers larger than the gaps carry from one detector to the others, a reference with stars "
-    "on them (--reference), or what is known of the layout (--layout-sigma, a camera file); --layout hold takes it as "
-    "exact"
+    "on them (--reference)"
 )
+_STATE = ", or what is known of the layout (--layout-sigma, a camera file); --layout hold takes it as exact"
+#: The same where headers are known to be wrong, which would be stated or held.
+_STATE_OTHER = ", or a camera file that was found otherwise (--camera): not what these headers state, which is wrong"
 _ODD = (
     "this solution does not count on that header: nothing is to be done for it; other programs need a better one, "
     "which legdistort attach writes"
@@ -71,7 +73,10 @@ def _few(solution, found):
     if not few:
         return None
     words = f"how groups of detectors lie to each other rests on {ties.in_words(few)}: a wrong one would not show"
-    return Check("camera", "warn", float(min(number for *_, number in few)), float(ties.FEWEST), words, _TIE)
+    headers = solution.camera.headers
+    wrong = headers is not None and (bool(headers.odd) or headers.is_undecided)
+    cure = _TIE + (_STATE_OTHER if wrong else _STATE)
+    return Check("camera", "warn", float(min(number for *_, number in few)), float(ties.FEWEST), words, cure)
 
 
 def _headers_by_group(solution):
@@ -124,16 +129,22 @@ def contradicted_layout(solution, camera):
     seen, agree = np.zeros((2, len(stars), len(names)), dtype=bool)
     seen[star, detector] = True
     agree[star[used], detector[used]] = True
-    crossing = seen.sum(axis=1) > 1
-    number = np.count_nonzero(crossing & (agree.sum(axis=1) < 2))
-    if np.count_nonzero(crossing) < _FEWEST or number < np.count_nonzero(crossing) / 2:
+    tried = [np.arange(len(names)), *map(list, combinations(range(len(names)), 2))]  # all together, then two by two
+    for some in tried:
+        crossing = seen[:, some].sum(axis=1) > 1
+        number, n_stars = np.count_nonzero(crossing & (agree[:, some].sum(axis=1) < 2)), np.count_nonzero(crossing)
+        if number < (n_stars / 2 if n_stars >= _FEWEST else max(n_stars, 1)):
+            continue
+        rows = np.isin(star, np.flatnonzero(crossing)) & np.isin(detector, some)
+        far, worst = _farthest(residuals[rows], star[rows], detector[rows])
+        if n_stars >= _FEWEST or far > LEAST:  # a star or two may be mismatches, but not by so much
+            break
+    else:
         return None
-    far, worst = _farthest(residuals, star, detector)
-    names = names[worst] if len(names) > 2 else " against ".join(names)
+    names = names[worst] if len(some) > 2 else " against ".join(names[some])
     found = (
         f"the layout was taken as exact, and the stars contradict it: detector {names} lies {far:.0f} px from where it "
-        f"has it ({number} of {np.count_nonzero(crossing)} stars that cross to another detector are left out on one of "
-        "them)"
+        f"has it ({number} of {n_stars} stars that cross to another detector are left out on one of them)"
     )
     instead = " instead of --layout hold" * (solution.settings.layout == "hold")
     return Check("camera", "fail", far, None, found, f"{LAYOUT.cure}{instead}")
@@ -162,7 +173,8 @@ def undetermined(solution):
     if errors is None or not errors.unknown.shape[2]:
         return None
     apart = ties.apart(solution.camera, solution.residuals)
-    return f"these exposures do not determine how the detectors lie to each other{f' ({apart})' * bool(apart)}", _TIE
+    words = f"these exposures do not determine how the detectors lie to each other{f' ({apart})' * bool(apart)}"
+    return words, _TIE + (_STATE if _headers_by_group(solution) is None else _STATE_OTHER)
 
 
 def _held(effects, name, residuals, observed, error, judged):

@@ -332,10 +332,22 @@ def absolute_check(solution, others):
     unknown, warning = solution.gauge.unknown_names, solution.gauge.warning
     if unknown:
         sentence, _, cure = warning.partition("; ")
-        return Check("absolute", "unknown", len(unknown), 0, sentence, cure)
+        return Check("absolute", "unknown", len(unknown), 0, sentence, cure + _by_headers(solution, unknown))
     error = solution.gauge.absolute_error
     known = f"absolute positions are known to {error:.2g} px rms per axis over the field, the noise of stars aside"
     return Check("absolute", "pass", error, None, f"{known}; they rest on {_grounds(solution.gauge, others)}")
+
+
+def _by_headers(solution, unknown):
+    """What headers may tell of `unknown` maps if it is said how well, in words: pointings; of a camera a shear too."""
+    settings, camera = solution.settings, solution.camera
+    if solution.sky is None or settings.pose_sigma is not None or settings.dynamic == "detector":
+        return ""
+    words = "; or say how well headers know the poses (--pose-sigma shift=PIXELS,rotation=DEGREES)"
+    free = camera is not None and camera.headers is not None and settings.layout_sigma is None
+    if free and settings.layout != "hold" and unknown == ("shear",):
+        words += " or the layout (--layout-sigma shift=PIXELS,rotation=DEGREES)"
+    return words
 
 
 def _grounds(gauge, others):
