@@ -29,6 +29,18 @@ def planes(text):
     return () if text == "none" else tuple(text.upper().split(","))
 
 
+def some_words(choices):
+    """Parser of some words, ``NAME,...``, as a list."""
+
+    def parse(text):
+        for word in (words := text.split(",")):
+            if word not in choices:
+                raise argparse.ArgumentTypeError(f"{word!r} is none of {', '.join(choices)}")
+        return words
+
+    return parse
+
+
 def pairs(text):
     """``{name: number}`` of ``NAME=NUMBER,...``."""
     try:

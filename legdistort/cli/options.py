@@ -13,6 +13,7 @@ from .arguments import (
     number_or_name,
     pairs,
     planes,
+    some_words,
     spectrum,
     word_or,
 )
@@ -316,10 +317,11 @@ SOLVING = Group(
             metavar="ARCSEC",
         ),
         "terms": Option(
-            "what displaces stars beside the distortion: refraction (column colour), pixel_phase",
+            f"what displaces stars beside the distortion, found too: {', '.join(words.TERMS)}",
             "--term",
-            action="append",
-            choices=words.TERMS,
+            type=some_words(words.TERMS),
+            action="extend",
+            metavar="NAME,...",
         ),
     },
 )

@@ -118,4 +118,4 @@ def _text(value):
         return None
     if isinstance(value, dict):
         return ",".join(f"{key}={number!r}" for key, number in value.items())
-    return (",".join(value) or "none") if isinstance(value, tuple) else str(value)
+    return (",".join(value) or "none") if isinstance(value, tuple | list) else str(value)

@@ -21,7 +21,7 @@ FLAGS = {flag: option for _, flag, _, option in flagged(GROUPS) if flag != "--sc
 #: Texts of options without a list of words; a number does for all others.
 TEXTS = {
     "--prior": "gsaoi-1", "--layout-sigma": "shift=1.5,rotation=1e-05", "--pose-sigma": "shift=0.0", "--planes": "none",
-    "--clip": "0",
+    "--clip": "0", "--term": "refraction,pixel_phase",
 }  # fmt: skip
 
 
@@ -43,7 +43,7 @@ def going_on(folder, *words):
 def test_every_option_holds_again(flag, tmp_path):
     """But those of the machine; and it gives way to another value, or is left out."""
     option = FLAGS[flag]
-    alone = option.settings.get("action") is not None
+    alone = option.settings.get("action", "extend") != "extend"
     *_, text = option.settings.get("choices", [TEXTS.get(flag, "2")])
     words = [flag] if alone else [flag, str(text)]
     plain, asked = (parser._parsed(["run", "a.fits", "--out", "o", *more]) for more in ([], words))
