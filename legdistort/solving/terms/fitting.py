@@ -71,14 +71,13 @@ def fit_with(terms, estimate, matches, options, *how):
     SolveError
         For more numbers than can be found at once.
     """
-    values = {}
+    if not terms:
+        fit, *rest = estimate(matches, options, *how)
+        return fit, lambda _: (), rest
+    values, begun = {}, _unclipped(estimate, matches, options, *how)
     for number in range(_FITS):
-        if not terms:
-            fit, *rest = estimate(matches, options, *how)
-            return fit, lambda _: (), rest
-        if number or not (begun := _unclipped(estimate, matches, options, *how)):
-            begun = estimate(matches, options, *how)
-        fit, *rest = begun
+        fit, *rest = begun or estimate(matches, options, *how)
+        begun = None
         numbers = _Numbers.of(terms, fit, values)
         step = numbers.step(fit, np.array([values.get(key, 0.0) for key in numbers.keys]))
         values = dict(zip(numbers.keys, step.values, strict=True))
@@ -153,7 +152,7 @@ class _Numbers:
         """Those of some terms in the observations of a `Fit`, made with values ``{key: value}`` of them."""
         keys, n_owners, sizes, roots, patterns = [], [], [], [], []
         for term, names, owner, columns, known in _made(terms, fit, values):
-            asked = _asked(fit, owner, columns, known) if term.each else np.arange(len(names))
+            asked = _asked(fit, term, owner, columns, known) if term.each else np.arange(len(names))
             k, n = len(term.numbers), len(asked)
             if 2 * k * n * len(owner) > _VALUES or k * n > _MOST:
                 raise SolveError(
@@ -304,7 +303,7 @@ def _made(terms, fit, values):
     return made
 
 
-def _asked(fit, owner, columns, known):
+def _asked(fit, term, owner, columns, known):
     """Which owners may have numbers, by what their own observations say, distortions held; and those that have some."""
     problem, blocks, n = fit.weighted, fit.blocks, len(known)
     (wx, wy, wxy), (x, y) = problem.weight, columns.transpose(1, 0, 2)
@@ -315,7 +314,7 @@ def _asked(fit, owner, columns, known):
     pull = np.einsum("akn,an->kn", moved, blocks.residual)
     k = len(columns)
     normal = np.array([[np.bincount(owner, left[i, j], n) for j in range(k)] for i in range(k)]).transpose(2, 0, 1)
-    if n == problem.n_stars:  # then an owner is a star, whose position and motion follow
+    if term.owner == "star":  # whose position and motion follow
         alone = np.array([[np.bincount(owner, row, n) for row in rows] for rows in at_star]).transpose(2, 0, 1)
         normal = normal - alone.mT @ unpacked(inverse_star_blocks(blocks.v)) @ alone
     pull = np.array([np.bincount(owner, row, n) for row in pull]).T + np.einsum("jab,jb->ja", normal, known)
