@@ -289,6 +289,17 @@ def test_a_night_is_odd_from_three_times_the_scatter_of_the_others(size, named):
     assert (worst["ratio"] > 3) == worst["odd"] == named
 
 
+@pytest.mark.parametrize(("last", "odd"), [(0.25, []), (1.0, [7])])
+def test_modes_of_a_degree_need_not_scatter_alike(last, odd):
+    """Where one alone does, five times its scatter is no odd night of eight, as it was beside modes that do not."""
+    nights = Nights(3, roll=0.7, nightly=0.0, single=0.01, n_stars=120)
+    size = np.array([0.04, -0.05, 0.05, -0.04, 0.05, -0.05, 0.04, last])
+    table = nights.table
+    table["x"] += size[np.asarray(table["block"])] * ((2 * table["x"] + 1) / SIZE - 1) ** 3
+    found = solved(nights).nights
+    assert sorted(found["block"][found["odd"]]) == odd
+
+
 def test_one_night_has_nothing_to_be_compared_with():
     (row,) = solved(Nights(0, nights=1)).nights
     assert (row["n_exposures"], row["dof"], row["p"], row["odd"]) == (5, 0, 1, False)

@@ -74,11 +74,11 @@ def nights_check(solution, *, error):
         named = f"night {row['name']} ({some_of(exposures, MOST_NAMED)}) departs"
         found.append(_far(named, row["ratio"], row["departure"].value))
         leave_out += [row["name"]] if row["name"] not in solution.names else exposures
-    worst = odd[0]
+    worst, those = odd[0], "them" if len(odd) > 1 else "it"
     state = state_of(min(1, worst["p"] * len(nights)), max(odd["departure"].value) > error)
     return Check("nights", state, worst["ratio"], ODD,
                  f"{'; '.join(found)}; what it departs by counts as its own, and the rest is compared without it",
-                 f"look at what was different then; solve --without {shlex.join(leave_out)} leaves it out",
+                 f"look at what was different then; solve --without {shlex.join(leave_out)} leaves {those} out",
                  tests=tuple(map(_of_night, odd)))  # fmt: skip
 
 

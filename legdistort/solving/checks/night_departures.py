@@ -272,8 +272,13 @@ class _Means:
             return NightTest()
         pull = directions @ away
         chi2 = max(pull @ np.linalg.solve(directions @ covariance @ directions.T, pull), 0)
-        freedom = self._freedom(others, unseen) if n > FEWEST else np.full(len(others.sizes), np.inf)
-        p = [_chance(away, covariance, self.degrees == degree, freedom[degree - 1]) for degree in set(self.degrees)]
+        freedom, even = np.full(len(others.sizes), np.inf), np.ones(len(others.sizes))
+        if n > FEWEST:
+            freedom, even = self._freedom(others, unseen), self._evenness(others, unseen)
+        p = [
+            _chance(away, covariance, self.degrees == degree, freedom[degree - 1], even[degree - 1])
+            for degree in set(self.degrees)
+        ]
         p, ratio = min(1.0, len(p) * min(p)), np.sqrt(chi2 / len(directions))
         odd = n - len(out | {k}) >= FEWEST and p < alarm and ratio > ODD
         return NightTest(
@@ -289,6 +294,24 @@ class _Means:
             out += np.bincount(self.degrees - 1, share, len(out))
         return out
 
+    def _evenness(self, posterior, unseen):
+        """Part of the modes of every degree that scatter, (n_degrees,): 1 where all do alike, as one size has it.
+
+        Where few do, so many fewer squares tell that size, and a departure in these alone is no rarer than in one of
+        them (Satterthwaite 1946): by the fourth moments of the nights, as those of a normal distribution.
+        """
+        n, k = self.values.shape
+        seen = np.isin(np.arange(n), list(unseen), invert=True)
+        expected = np.tile(posterior.sizes[self.degrees - 1] ** 2, n) - np.diag(posterior.of_rows)[: n * k]
+        square = posterior.left[0][: n * k] ** 2
+        square, expected = (each.reshape(n, k)[seen].sum(axis=0) for each in (square, expected))
+        ratio, out = square / np.maximum(expected, 1e-300), np.ones(len(posterior.sizes))
+        for degree in set(self.degrees):
+            mine = ratio[self.degrees == degree]
+            fourth = np.mean(mine**2) / (1 + 2 / max(np.count_nonzero(seen) - 1, 1))
+            out[degree - 1] = np.clip(np.mean(mine) ** 2 / max(fourth, 1e-300), 1 / len(mine), 1)
+        return out
+
     def _precision(self, posterior, k):
         """Inverse covariance (K, K) of what a night departs by from the prediction of all others in a posterior."""
         rows = slice(k * len(self.degrees), (k + 1) * len(self.degrees))
@@ -297,12 +320,15 @@ class _Means:
         return (out + out.T) / 2
 
 
-def _chance(away, covariance, of, dof):
-    """Probability of a departure in some coefficients, whose squares are compared with others of so many degrees."""
+def _chance(away, covariance, of, dof, even):
+    """Probability of a departure in some coefficients, whose squares are compared with others of so many degrees.
+
+    `even` is the part of them that scatter.
+    """
     m, square = np.count_nonzero(of), away[of] @ np.linalg.solve(covariance[np.ix_(of, of)], away[of])
     if np.isinf(dof):
-        return special.chdtrc(m, square)
-    return special.fdtrc(m, dof, square / m) if dof >= 1 else 1.0
+        return special.chdtrc(even * m, even * square)
+    return special.fdtrc(even * m, even * dof, square / m) if even * dof >= 1 else 1.0
 
 
 def _within(apart, noise, owner, degrees):
