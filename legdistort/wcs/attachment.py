@@ -210,7 +210,12 @@ class _Images:
     def of_file(self, name, header):
         """Name of the exposure, or of the part of one, in a file of one detector; None if it is of another."""
         labels = {*self.views, *self.left_out}
-        return detector_files.label_of(name, header, labels, exact=not self.of_camera)
+        found = detector_files.label_of(name, header, labels, exact=not self.of_camera)
+        if found is not None or not self.of_camera:
+            return found
+        # a file with nothing but a gwcs has its detector in the name
+        named = [k for k, view in self.views.items() if detector_files.without_id(name, view.detector) == view.name]
+        return named[0] if len(named) == 1 else None
 
     @classmethod
     def of(cls, solution):

@@ -182,8 +182,12 @@ def gwcs_of_asdf(*keys):
 
 @pytest.mark.parametrize(
     ("ending", "read"),
-    [("cal.fits", gwcs_of_fits), ("model.asdf", gwcs_of_asdf("meta", "wcs"))],
-    ids=["frames", "models"],
+    [
+        ("cal.fits", gwcs_of_fits),
+        ("model.asdf", gwcs_of_asdf("meta", "wcs")),
+        ("wcs.asdf", gwcs_of_asdf("wcs")),
+    ],
+    ids=["frames", "models", "bare gwcs"],
 )
 def test_a_visit_by_its_catalogues(ending, read, visit, tmp_path, monkeypatch):
     """Solved as a camera, with its layout found; stars agree to their noise in the files that come out."""
