@@ -201,7 +201,11 @@ def match(
     if camera is not None and len(names) > 1:
         _check_detectors(camera, table, star, shapes)
     tying = None if camera is None or len(names) == 1 else _ties_of_few(camera, table, star, min_exposures)
+    whole = len(table)
     table, star = _keep_common(table, star, 1 if len(names) == 1 else min_exposures, left_out, tying)
+    if few := whole - len(table):
+        log.info("%d of %d detections are of stars in fewer than %d exposures (min_exposures), and left out",
+                 few, whole, min_exposures)  # fmt: skip
     epoch = mean_epoch(e.header for e in named.values()) if named else None
     _add_epochs(table, named or {})
     distortions = header_distortions(named[name] for name in np.unique(table["exposure"])) if named else {}
