@@ -201,11 +201,7 @@ def match(
     if camera is not None and len(names) > 1:
         _check_detectors(camera, table, star, shapes)
     tying = None if camera is None or len(names) == 1 else _ties_of_few(camera, table, star, min_exposures)
-    whole = len(table)
-    table, star = _keep_common(table, star, 1 if len(names) == 1 else min_exposures, left_out, tying)
-    if few := whole - len(table):
-        log.info("%d of %d detections are of stars in fewer than %d exposures (min_exposures), and left out",
-                 few, whole, min_exposures)  # fmt: skip
+    table, star = _keep_common(table, star, 1 if len(names) == 1 else min_exposures, left_out, tying, tell=True)
     epoch = mean_epoch(e.header for e in named.values()) if named else None
     _add_epochs(table, named or {})
     distortions = header_distortions(named[name] for name in np.unique(table["exposure"])) if named else {}
@@ -453,8 +449,11 @@ def _ties_of_few(camera, table, star, min_exposures):
     return tying[inverse]
 
 
-def _keep_common(table, star, min_exposures, left_out, tying=None):
-    """Rows of stars in enough exposures, or of those `tying` detectors; exposures with fewer than 3 of these go too."""
+def _keep_common(table, star, min_exposures, left_out, tying=None, *, tell=False):
+    """Rows of stars in enough exposures, or of those `tying` detectors; exposures with fewer than 3 of these go too.
+
+    How many do not stay is told, if that is wanted.
+    """
     exposure = np.asarray(table["exposure"])
     while True:
         _, inverse, count = np.unique(star, return_inverse=True, return_counts=True)
@@ -473,6 +472,9 @@ def _keep_common(table, star, min_exposures, left_out, tying=None):
             {str(n): f"only {poor.get(n, 0)} of its stars are in {min_exposures} exposures" for n in [*poor, *absent]}
         )
         if not poor:
+            if tell and not keep.all():
+                log.info("%d of %d detections are of stars in fewer than %d exposures (min_exposures), and left out",
+                         np.count_nonzero(~keep), len(keep), min_exposures)  # fmt: skip
             return table[keep], star[keep]
         star = np.where(np.isin(exposure, list(poor)), -1, star)
 
