@@ -47,7 +47,7 @@ class Offsets:
     ratio: float
     p: float
 
-    def in_words(self, unit, degree):
+    def in_words(self, unit: str, degree: int) -> str:
         """The figures in a sentence."""
         over = f" ({self.ratio_similarity:.2g} times the absolute errors)" * bool(np.isfinite(self.ratio_similarity))
         chance = f", p = {self.p:.2g}" * bool(np.isfinite(self.p))
