@@ -11,6 +11,8 @@ import legdistort as ld
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.geometry.zenith import stated_zenith
+from legdistort.runtime import words
+from legdistort.solving.terms.term import TERMS
 
 
 def test_refraction_is_taken_off():
@@ -198,6 +200,10 @@ def test_what_a_term_lacks_is_named():
         field.solve(terms="refraction")
     with pytest.raises(InputError, match="terms do not go with validate"):
         field.solve(terms="pixel_phase", validate=0.2)
+
+
+def test_the_command_knows_all_terms():
+    assert set(words.TERMS) == set(TERMS)
 
 
 @pytest.mark.parametrize(

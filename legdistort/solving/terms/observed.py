@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from astropy import units as u
 
-from ...geometry import basis
+from ...geometry.distortion import Distortion
 from ...geometry.epochs import ONE_EPOCH
 from ...inputs import column_contract
 
@@ -131,20 +131,17 @@ class Observed:
 
     def on_detector(self, plane):
         """Displacements (2, n) of the reference plane as they are measured: on the detector, or in the focal plane."""
-        return np.einsum("abn,bn->an", self._slope, plane)
+        return np.einsum("nab,bn->an", self._slope, plane)
 
     @cached_property
     def _slope(self):
-        """Derivatives (2, 2, n) of what is measured by the place in the reference plane."""
-        problem, state, out = self.problem, self.state, np.empty((2, 2, len(self.exposure)))
-        top = basis.degree_of(state.coefficients.shape[2])
-        for i, (shape, own) in enumerate(zip(problem.shapes, state.coefficients, strict=True)):
-            part = problem.part(i)
-            _, by_u, by_v = basis.gradients(top, *basis.normalize(problem.xy[:, part].T, shape))
-            bent = np.stack([own @ by_u * (2 / shape[1]), own @ by_v * (2 / shape[0])], axis=1)
-            bent[[0, 1], [0, 1]] += 1
-            out[:, :, part] = np.einsum("abn,bc->acn", bent, state.poses[i][:, :2])
-        return out
+        """Derivatives (n, 2, 2) of what is measured by the place in the reference plane."""
+        problem, state = self.problem, self.state
+        bent = [
+            Distortion(own, shape).jacobian(problem.xy[:, problem.part(i)].T)
+            for i, (own, shape) in enumerate(zip(state.coefficients, problem.shapes, strict=True))
+        ]
+        return np.concatenate(bent) @ state.poses[self.exposure][:, :, :2]
 
     def from_detector(self, displacements):
         """Displacements (..., 2, n) along the axes of the detectors as positions have them: in the focal plane."""
