@@ -3,6 +3,9 @@
 ``D(q) = q + sum_m a_m b_m(u(q))`` (Bernard et al. 2017, eq. for X_ij in section 2.1, with the basis in
 detector coordinates). D is exact; the opposite direction has no closed form and is fitted once by a
 Legendre tensor whose degree is raised until the round trip holds.
+
+What no polynomial describes is in a table, ``D(q) = q + sum_m a_m b_m(u(q)) + t(q)``, linear between its nodes. The
+inverse is then that of the series and a second table for what remains.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees.facts import array, number
 from . import basis, similarity
 from .models import CHUNK, correction_model
+from .tabulated.displacement_table import DisplacementTable
 
 if TYPE_CHECKING:
     from astropy.modeling import Model
@@ -25,9 +29,13 @@ if TYPE_CHECKING:
 
 #: Largest round-trip error of a certified inverse, pixels.
 TOLERANCE = 1e-6
+#: The same of a distortion with a table.
+TABLE_TOLERANCE = 1e-3
 #: A Jacobian determinant below this counts as a fold.
 FOLD = 0.1
 _MAX_INVERSE_DEGREE = 30
+#: Steps of the table of an inverse, by that of the distortion, until it is good enough.
+_FINER = 1, 1 / 2, 1 / 4, 1 / 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +50,14 @@ class Inverse:
         Largest round-trip error found, detector pixels.
     valid : tuple
         ``(x_min, x_max, y_min, y_max)``: box of undistorted pixels around the image of the detector.
+    table : DisplacementTable, optional
+        What is added to the tensors, where the distortion has a table.
     """
 
     tensors: np.ndarray = field(metadata=array(2, "n", "n", unit="pix"))
-    error: float = field(metadata=number(entry="error_px", minimum=0, maximum=TOLERANCE, unit="pix"))
+    error: float = field(metadata=number(entry="error_px", minimum=0, maximum=TABLE_TOLERANCE, unit="pix"))
     valid: tuple[float, float, float, float] = field(metadata=number(entry="valid_undistorted_px", unit="pix"))
+    table: DisplacementTable | None = None
 
     def __repr__(self) -> str:
         return f"<Inverse: degree {self.tensors.shape[1] - 1}, error {self.error:.1e} px>"
@@ -66,18 +77,21 @@ class Distortion(ShownAsPrinted):
         For messages.
     certified : Inverse, optional
         One that was certified earlier. It is checked against its certificate again, and then is `inverse`.
+    table : DisplacementTable, optional
+        Displacements beside the series, at undistorted pixels.
 
     Raises
     ------
     InputError
-        For coefficients of another shape or not finite; if the round-trip error of `certified` is not the one that it
-        states, or its region of validity not the image of the detector.
+        For coefficients of another shape or not finite, or a table that is none; if the round-trip error of `certified`
+        is not the one that it states, or its region of validity not the image of the detector.
     """
 
     coefficients: np.ndarray
     shape: tuple[int, int]
     name: str = ""
     certified: Inverse | None = None
+    table: DisplacementTable | None = None
 
     def __post_init__(self) -> None:
         c = np.asarray(self.coefficients, dtype=float)
@@ -85,6 +99,8 @@ class Distortion(ShownAsPrinted):
             raise InputError(f"coefficients must be finite, of shape (2, n_modes), got shape {c.shape}")
         basis.degree_of(c.shape[1])
         object.__setattr__(self, "coefficients", c)
+        if not isinstance(self.table, DisplacementTable | None):
+            raise InputError(f"table must be a DisplacementTable or None, got {type(self.table).__name__}")
         if self.certified is not None:
             self._check_certificate(self.certified)
 
@@ -97,10 +113,16 @@ class Distortion(ShownAsPrinted):
         ny, nx = self.shape
         return f"<Distortion{f' of {self.name}' if self.name else ''}: degree {self.degree}, {nx} x {ny} px>"
 
+    def same_as(self, other: Distortion) -> bool:
+        """Whether it is the same map of the same detector, to the last bit."""
+        alike = self.shape == other.shape and np.array_equal(self.coefficients, other.coefficients)
+        return alike and self.table == other.table
+
     def __call__(self, q: ArrayLike) -> np.ndarray:
         """Undistorted pixels (n, 2) -> detector pixels (n, 2)."""
         q = np.asarray(q, dtype=float)
-        return q + (self.coefficients @ basis.values(self.degree, *basis.normalize(q, self.shape))).T
+        p = q + (self.coefficients @ basis.values(self.degree, *basis.normalize(q, self.shape))).T
+        return p if self.table is None else p + self.table(q)
 
     def jacobian(self, q: ArrayLike) -> np.ndarray:
         """Derivative dD/dq, shape (n, 2, 2), first index the detector axis."""
@@ -114,7 +136,8 @@ class Distortion(ShownAsPrinted):
         jacobian[:, :, 1] = (self.coefficients @ bv).T * (2 / ny)
         jacobian[:, 0, 0] += 1
         jacobian[:, 1, 1] += 1
-        return q + (self.coefficients @ b).T, jacobian
+        p = q + (self.coefficients @ b).T
+        return (p, jacobian) if self.table is None else (p + self.table(q), jacobian + self.table.jacobian(q))
 
     def invert(self, p: ArrayLike, *, tolerance: float = 1e-10, max_iterations: int = 50) -> np.ndarray:
         """Detector pixels (n, 2) -> undistorted pixels by Newton's method.
@@ -167,7 +190,8 @@ class Distortion(ShownAsPrinted):
             return
         t = np.linspace(-1, 1, 8 * self.degree + 9)
         q = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), self.shape)
-        determinant = np.linalg.det(self.jacobian(q))
+        q = q if self.table is None else np.concatenate([q, self.table.cells])
+        determinant = np.concatenate([np.linalg.det(self.jacobian(q[k : k + CHUNK])) for k in range(0, len(q), CHUNK)])
         worst = int(np.argmin(determinant))
         if determinant[worst] <= FOLD:
             self._raise_fold(q[worst], f"folds (Jacobian determinant {determinant[worst]:.2f})")
@@ -178,20 +202,23 @@ class Distortion(ShownAsPrinted):
         i, j = basis.orders(self.degree)
         slopes = np.stack([i * (i + 1), j * (j + 1)], axis=1)  # 2 P_n'(1), by pixels of the detector
         steepest = (basis.norm(i) * basis.norm(j))[:, None] * slopes
-        return float(np.linalg.norm(np.abs(self.coefficients) @ (steepest / self.shape[::-1])))
+        series = float(np.linalg.norm(np.abs(self.coefficients) @ (steepest / self.shape[::-1])))
+        return series if self.table is None else series + self.table.steepest
 
     @cached_property
     def inverse(self) -> Inverse:
-        """The fitted `Inverse`, certified to `TOLERANCE` on a grid, random points, the edges and the corners.
+        """The fitted `Inverse`, certified to `tolerance` on a grid, random points, the edges and the corners.
 
         Raises
         ------
         FoldError
-            If the map folds, or no inverse of degree up to 30 reaches the tolerance.
+            If the map folds, or no inverse of degree up to 30, or no table, reaches the tolerance.
         """
         if self.certified is not None:
             return self.certified
         self.check_fold()
+        if self.table is not None:
+            return self._tabulated_inverse(self.table)
         nodes, weights = np.polynomial.legendre.leggauss(_MAX_INVERSE_DEGREE + 12)
         u, v = np.meshgrid(nodes, nodes, indexing="ij")
         p = basis.denormalize(u.ravel(), v.ravel(), self.shape)
@@ -200,7 +227,7 @@ class Distortion(ShownAsPrinted):
         normalised = np.einsum("ui,vj,auv->aij", vander, vander, shift, optimize=True)
         norms = basis.norm(np.arange(_MAX_INVERSE_DEGREE + 1))
         tensors = normalised * np.outer(norms, norms)
-        check = _check_points(self.shape)
+        check = self._check_points
         q = self.invert(check)
         errors = []
         for degree in range(max(self.degree, 1), _MAX_INVERSE_DEGREE + 1):
@@ -214,25 +241,59 @@ class Distortion(ShownAsPrinted):
             "the distortion is too strong or too ragged, lower the degree"
         )
 
-    def round_trip_error(self, tensors: Any, p: np.ndarray | None = None) -> float:
-        """Largest ``|D(E(p)) - p|`` [pix] of an inverse E given by its displacement tensors, over check points."""
-        p = _check_points(self.shape) if p is None else p
-        return float(np.abs(self(self._corrected(tensors, p)) - p).max())
+    def _tabulated_inverse(self, table):
+        """The inverse of the series alone, with a table for what remains."""
+        smooth = Distortion(self.coefficients, self.shape, self.name).inverse
+        check, error = self._check_points, np.inf
+        box = _valid_box(self.invert(check), self.shape)
 
-    def _corrected(self, tensors, p):
-        """Detector pixels (n, 2) -> undistorted pixels by the displacement tensors of an inverse."""
+        def remaining(p):
+            return self.invert(p) - self._corrected(smooth.tensors, p)
+
+        for part in _FINER:
+            rest = DisplacementTable.of(remaining, self.shape, (part * table.step[0], part * table.step[1]), margin=0)
+            error = self.round_trip_error(smooth.tensors, check, rest)
+            if error <= self.tolerance / 2:
+                return Inverse(smooth.tensors, error, box, rest)
+        raise FoldError(
+            f"no inverse of the distortion{f' of exposure {self.name}' if self.name else ''} by a table is better than "
+            f"{error:.1e} px ({self.tolerance:.0e} is wanted): its own table is too ragged, give one with finer steps"
+        )
+
+    @property
+    def tolerance(self) -> float:
+        """Largest round-trip error that its inverse may have, pixels."""
+        return TOLERANCE if self.table is None else TABLE_TOLERANCE
+
+    @property
+    def _check_points(self):
+        """Where inverses are tried, (n, 2) pixels; more places for what is ragged."""
+        return _check_points(self.shape, 1000 if self.table is None else 20_000)
+
+    def round_trip_error(
+        self, tensors: Any, p: np.ndarray | None = None, table: DisplacementTable | None = None
+    ) -> float:
+        """Largest ``|D(E(p)) - p|`` [pix] of an inverse E by its displacement tensors, and table, over check points."""
+        p = self._check_points if p is None else p
+        return float(np.abs(self(self._corrected(tensors, p, table)) - p).max())
+
+    def _corrected(self, tensors, p, table=None):
+        """Detector pixels (n, 2) -> undistorted pixels by the displacement tensors of an inverse, and its table."""
+        if len(p) > CHUNK:
+            return np.concatenate([self._corrected(tensors, p[k : k + CHUNK], table) for k in range(0, len(p), CHUNK)])
         u, v = basis.normalize(p, self.shape)
         norms = basis.norm(np.arange(np.shape(tensors)[1]))
         along, across = (basis.legendre(len(norms) - 1, w) for w in (u, v))
         normalised = np.asarray(tensors) / np.outer(norms, norms)
-        return p + np.stack([np.einsum("jn,jn->n", t.T @ along, across) for t in normalised], axis=-1)
+        q = p + np.stack([np.einsum("jn,jn->n", t.T @ along, across) for t in normalised], axis=-1)
+        return q if table is None else q + table(p)
 
     def _check_certificate(self, inverse):
-        p = _check_points(self.shape)
-        q = self._corrected(inverse.tensors, p)
+        p = self._check_points
+        q = self._corrected(inverse.tensors, p, inverse.table)
         error, box = np.abs(self(q) - p).max(), _valid_box(q, self.shape)
         whose = f"the inverse of the distortion{f' of exposure {self.name}' if self.name else ''}"
-        if not (abs(error - inverse.error) <= 1e-9 and error <= TOLERANCE):
+        if not (abs(error - inverse.error) <= 1e-9 and error <= self.tolerance):
             raise InputError(
                 f"{whose} misses by {error:.3g} px where {inverse.error:.3g} px was certified: coefficients or inverse "
                 "were changed since; solve again, or take the file as it was written"
@@ -247,7 +308,7 @@ class Distortion(ShownAsPrinted):
 
     def correction_model(self) -> Model:
         """Detector -> undistorted pixels as an astropy compound model, D attached as its inverse."""
-        return correction_model(basis.to_tensor(self.coefficients), self.inverse, self.shape)
+        return correction_model(basis.to_tensor(self.coefficients), self.inverse, self.shape, self.table)
 
     def model(self) -> Model:
         """D as an astropy compound model (undistorted -> detector pixels) with the certified inverse attached."""
@@ -265,11 +326,11 @@ def _solve2(a, b):
     return np.stack([x, y], axis=1)
 
 
-def _check_points(shape):
+def _check_points(shape, n):
     """Random points, a regular grid with the edges and the corners of a detector, (n, 2) pixels."""
     t = np.linspace(-1, 1, 33)
     grid = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
-    scattered = np.random.default_rng(20170101).uniform(-1, 1, (1000, 2))
+    scattered = np.random.default_rng(20170101).uniform(-1, 1, (n, 2))
     edge = np.linspace(-1, 1, 129)
     ends = np.ones_like(edge)
     sides = np.concatenate([np.stack(s, axis=1) for s in ((edge, ends), (edge, -ends), (ends, edge), (-ends, edge))])

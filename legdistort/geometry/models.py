@@ -160,8 +160,8 @@ def outside(box, x, y):
     return ~((x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max))
 
 
-def displacement_model(tensors, shape, *, valid=None, name=None):
-    """Model (x, y) -> (x, y) + two Legendre series on the detector.
+def displacement_model(tensors, shape, *, valid=None, name=None, table=None):
+    """Model (x, y) -> (x, y) + two Legendre series on the detector, and perhaps a table.
 
     Parameters
     ----------
@@ -172,6 +172,7 @@ def displacement_model(tensors, shape, *, valid=None, name=None):
         ``(ny, nx)`` of the detector.
     valid : tuple, optional
         See `FastLegendre2D`.
+    table : DisplacementTable, optional
     """
     tensors = np.asarray(tensors, dtype=float)
     order = np.arange(tensors.shape[1])
@@ -181,12 +182,20 @@ def displacement_model(tensors, shape, *, valid=None, name=None):
         legendre_series(tensor, shape, fixed=fixed, valid=valid, name=f"d{axis}")
         for axis, tensor in zip("xy", tensors, strict=True)
     ]
-    model = models.Identity(2) + (models.Mapping((0, 1, 0, 1)) | (parts[0] & parts[1]))
+    model = with_table(models.Identity(2) + (models.Mapping((0, 1, 0, 1)) | (parts[0] & parts[1])), table)
     model.name = name
     return model
 
 
-def correction_model(tensors, inverse, shape):
+def with_table(model, table):
+    """A model of positions plus the displacements of a `DisplacementTable`; the model itself without one."""
+    if table is None:
+        return model
+    along_x, along_y = table.models()
+    return model + (models.Mapping((0, 1, 0, 1)) | (along_x & along_y))
+
+
+def correction_model(tensors, inverse, shape, table=None):
     """Detector -> undistorted pixels: the certified inverse forwards, the exact distortion attached backwards.
 
     Parameters
@@ -196,9 +205,11 @@ def correction_model(tensors, inverse, shape):
     inverse : Inverse
     shape : tuple
         ``(ny, nx)`` of the detector.
+    table : DisplacementTable, optional
+        Of the distortion, beside the tensors.
     """
-    correction = displacement_model(inverse.tensors, shape, name="correction")
-    correction.inverse = displacement_model(tensors, shape, valid=inverse.valid, name="distortion")
+    correction = displacement_model(inverse.tensors, shape, name="correction", table=inverse.table)
+    correction.inverse = displacement_model(tensors, shape, valid=inverse.valid, name="distortion", table=table)
     return correction
 
 

@@ -1,7 +1,8 @@
 """A detector in the focal plane of a camera, as one exposure of a solution has it.
 
 Pose, distortion of the focal plane, layout and static distortion together are again a similarity and a Legendre series
-on the detector, of a degree that is raised until less than a millionth of a pixel is left out. So what serves exposures
+on the detector, of a degree that is raised until less than a millionth of a pixel is left out; where the distortion of
+the focal plane has a table, of the fitted degree, with a table for the rest. So what serves exposures
 of one detector serves those of several: resampling, headers, pictures. Its errors are those of the focal plane and of
 the camera, carried to the same series.
 """
@@ -14,6 +15,7 @@ from astropy import units as u
 from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.distortion import Distortion
+from ..geometry.tabulated.displacement_table import DisplacementTable
 from .errors import absolute_errors
 
 #: Largest error of the series [pix], and the degree beyond which it is not raised.
@@ -30,10 +32,13 @@ class OnDetector:
         Similarity from the reference plane to undistorted pixels of the detector.
     coefficients : ndarray, shape (2, n_modes)
         What is left, undistorted -> detector pixels: normalised Legendre modes, pixels.
+    table : DisplacementTable or None
+        What no such series has, where the distortion of the focal plane has a table.
     """
 
     pose: np.ndarray
     coefficients: np.ndarray
+    table: DisplacementTable | None = None
 
 
 def on_detector(view):
@@ -55,6 +60,11 @@ def on_detector(view):
         return chip.to_pixels(common.distortion(similarity.apply(back, q))) - q
 
     series = basis.project(lambda u, v: shift(basis.denormalize(u, v, chip.shape)).T, HIGHEST, HIGHEST + 6)
+    if (ragged := common.distortion.table) is not None:
+        smooth = Distortion(basis.change_degree(series, max(view.solution.degree, 1)), chip.shape)
+        step = tuple(each / 2 for each in ragged.step)  # the nodes lie otherwise
+        rest = DisplacementTable.of(lambda q: shift(q) - smooth(q) + q, chip.shape, step)
+        return OnDetector(own, smooth.coefficients, rest)
     for degree in range(max(view.solution.degree, 1), HIGHEST + 1):
         part = basis.change_degree(series, degree)
         if np.abs(Distortion(part, chip.shape)(pixels) - pixels - shift(pixels)).max() < TOLERANCE:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..geometry.distortion import Distortion
+from ..geometry.tabulated.displacement_table import DisplacementTable
 from ..runtime.trees.facts import array
 from .errors.camera_errors import CameraErrors
 from .errors.common_maps import CommonFit
@@ -45,7 +46,10 @@ class Estimate:
         What nights show, or a function that makes it from the solution; None where it was not looked for.
     certified : dict
         ``{exposure: Distortion}`` that views have made, or a file has, with their certified inverses; they count as
-        long as the coefficients are the same.
+        long as the coefficients and tables are the same.
+    displacement_tables, static_tables : dict
+        ``{exposure: DisplacementTable}`` and ``{detector: DisplacementTable}``: what the distortion of an exposure has
+        beside its series, of its own and of its detector. `table_of` is the sum.
     """
 
     star_names: np.ndarray
@@ -58,6 +62,13 @@ class Estimate:
     checked: Any = field(default=(), repr=False)
     nights: Any = field(default=None, repr=False)
     certified: dict[str, Distortion] = field(default_factory=dict, repr=False)
+    displacement_tables: dict[str, DisplacementTable] = field(default_factory=dict)
+    static_tables: dict[str, DisplacementTable] = field(default_factory=dict)
+
+    def table_of(self, exposure: str, detector: str | None) -> DisplacementTable | None:
+        """What an exposure has beside its series, by itself and by its detector; None for nothing."""
+        own, static = self.displacement_tables.get(exposure), self.static_tables.get(detector or "")
+        return own + static if own is not None and static is not None else static if own is None else own
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,8 @@ from ..cameras import storage as cameras
 from ..cameras.camera import Camera
 from ..exceptions import FoldError, InputError
 from ..geometry import basis
-from ..geometry.distortion import Distortion, Inverse
+from ..geometry.distortion import Inverse
+from ..geometry.tabulated.displacement_table import DisplacementTable
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
 from ..inputs.plain_columns import plain, plain_columns, restored
@@ -43,6 +44,8 @@ from .settings import Settings
 LAYOUT = 1
 #: Entry of a file under which a solution stands.
 ROOT = "legdistort"
+#: Entries by name that files of earlier versions lack.
+_TABLES = "displacement_tables", "static_tables"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,6 +105,7 @@ def write_solution(solution, path, *, overwrite=False):
         "camera": to_tree(solution.camera) if solution.camera.is_known else None,
         "checks": [to_tree(each) for each in solution.checks],
         "nights": to_tree(nights.found(solution)),
+        **{kind: {key: to_tree(each) for key, each in getattr(estimate, kind).items()} for kind in _TABLES},
     }
     content = asdf.AsdfFile({"legdistort": tree}, version=ASDF_STANDARD)
     for column in tree["observations"].values():  # names repeat; covariances and coefficients would not get smaller
@@ -176,21 +180,21 @@ def _from_tree(kind, checksum, tree):
             motions=motions,
             checked=_part(tuple[Check, ...], tree, "checks", sizes),
             nights=_part(NightsFound | None, tree, "nights", sizes),
-            certified={
-                e.name: Distortion(e.coefficients, e.shape, e.name, e.inverse)  # checks the certificate
-                for e in exposures
-                if e.inverse is not None
-            },
+            **{entry: _part(dict[str, DisplacementTable], tree, entry, sizes) for entry in _TABLES},
         ),
         _checksum=checksum,
     )
     _check_consistent(solution)
+    for e in exposures:
+        if e.inverse is not None:  # checks the certificate
+            known = dataclasses.replace(solution[e.name].distortion, certified=e.inverse)
+            solution.estimate.certified[e.name] = known
     return solution
 
 
 def _part(kind, tree, entry, sizes, *, strict=True):
     """An entry of the tree; none of it for one that files of earlier versions lack."""
-    given = tree.get(entry, [] if entry == "checks" else None)
+    given = tree.get(entry, [] if entry == "checks" else {} if entry in _TABLES else None)
     return from_tree(kind, given, f"{ROOT}.{entry}", sizes=sizes, strict=strict)
 
 
@@ -238,6 +242,8 @@ def _check_consistent(solution):
     for column, known in (("exposure", solution.names), ("star", estimate.star_names)):
         if not np.isin(np.asarray(table[column]), known).all():
             raise ValueError(f"the table of residuals names {column}s that are not in the list of them")
+    if strange := sorted(set(estimate.displacement_tables) - set(solution.names)):
+        raise ValueError(f"there is a table of displacements of {strange[0]!r}, which is no exposure")
     if (tests := nights.found(solution).tests) and len(tests) != len(nights.blocks(solution)[1]):
         raise ValueError(f"there are tests of {len(tests)} nights, and {len(nights.blocks(solution)[1])} of these")
 

@@ -193,6 +193,7 @@ class View(ShownAsPrinted):
     def coefficients(self) -> np.ndarray:
         """Total distortion (2, n_modes), undistorted -> detector pixels: normalised Legendre modes in pixels, x first.
 
+        Where a term of the model found more than the series of the fitted degree has, `distortion` has a table beside.
         Of a detector in a focal plane the degree is as high as it takes to hold a millionth of a pixel.
 
         Examples
@@ -222,11 +223,15 @@ class View(ShownAsPrinted):
         <Distortion of exp00: degree 3, 2048 x 2048 px>
         """
         if self.chip is not None:
-            return Distortion(self.coefficients, self.shape, self.label)
-        known = self.solution.estimate.certified.get(self.name)
-        if known is not None and known.shape == self.shape and np.array_equal(known.coefficients, self.coefficients):
+            return Distortion(self.coefficients, self.shape, self.label, table=self._whole.table)
+        estimate = self.solution.estimate
+        of_one = bool(estimate.static_tables) and not self.solution.camera.has_focal_plane
+        table = estimate.table_of(self.name, self.detectors[0] if of_one else None)
+        made = Distortion(self.coefficients, self.shape, self.name, table=table)
+        known = estimate.certified.get(self.name)
+        if known is not None and known.same_as(made):
             return known
-        self.solution.estimate.certified[self.name] = made = Distortion(self.coefficients, self.shape, self.name)
+        estimate.certified[self.name] = made
         return made
 
     @cached_property

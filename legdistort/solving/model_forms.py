@@ -13,7 +13,7 @@ from astropy.modeling import CompoundModel, Model, models
 from ..exceptions import FoldError, InputError
 from ..geometry import basis, fitter, similarity
 from ..geometry.distortion import Distortion
-from ..geometry.models import FastLegendre2D, leaves, rebuilt
+from ..geometry.models import FastLegendre2D, leaves, rebuilt, with_table
 from ..priors.prior import UNSTATED, Prior
 
 #: A form must be a polynomial to this, pixels.
@@ -122,7 +122,7 @@ class Form:
         for part in leaves(out):
             if isinstance(part, FastLegendre2D):
                 part.valid = distortion.inverse.valid
-        return out
+        return with_table(out, distortion.table)
 
 
 def read(model, matches, *, degree):

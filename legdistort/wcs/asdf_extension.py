@@ -10,6 +10,7 @@ class StockConverter(Converter):
     types = (
         "legdistort.geometry.models.FastLegendre2D",
         "legdistort.geometry.models.Similarity2D",
+        "legdistort.geometry.tabulated.fast_tabular.FastTabular2D",
         "legdistort.geometry.tangent_plane.PlaneToSky",
         "legdistort.wcs.exposure_wcs.ExposureWCS",
     )

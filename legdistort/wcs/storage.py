@@ -14,8 +14,9 @@ from astropy.modeling import models
 
 from ..exceptions import InputError
 from ..geometry import basis
-from ..geometry.distortion import TOLERANCE, Distortion, Inverse
+from ..geometry.distortion import TABLE_TOLERANCE, Distortion, Inverse
 from ..geometry.models import correction_model, displacement_model, leaves, pose_model
+from ..geometry.tabulated.displacement_table import DisplacementTable
 from ..geometry.tangent_plane import PlaneToSky
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, WITH_WCS, check_tree, read_tree, understood
@@ -44,7 +45,7 @@ NOTE = (
 class Certificate:
     """Round-trip error of an inverse and the box of undistorted pixels in which it holds."""
 
-    error: float = field(metadata=number(entry="inverse_error_px", minimum=0, maximum=TOLERANCE, unit="pix"))
+    error: float = field(metadata=number(entry="inverse_error_px", minimum=0, maximum=TABLE_TOLERANCE, unit="pix"))
     valid: tuple[float, float, float, float] = field(metadata=number(entry="valid_undistorted_px", unit="pix"))
 
 
@@ -156,11 +157,12 @@ def _checked_correction(correction, tree, where, name):
     shape = round(y1 - y0), round(x1 - x0)
     tensors = [np.stack([part.parameters.reshape(part.y_degree + 1, -1).T for part in _series(m)])
                for m in (correction.inverse, correction)]  # fmt: skip
-    for model, tensor in zip((correction.inverse, correction), tensors, strict=True):
-        _check_same(model, displacement_model(tensor, shape), shape)
-    inverse = Inverse(tensors[1], certificate.error, certificate.valid)
-    Distortion(basis.from_tensor(tensors[0]), shape, name, inverse)  # checks the certificate
-    return correction_model(tensors[0], inverse, shape)
+    tables = [_table(m) for m in (correction.inverse, correction)]
+    for model, tensor, table in zip((correction.inverse, correction), tensors, tables, strict=True):
+        _check_same(model, displacement_model(tensor, shape, table=table), shape)
+    inverse = Inverse(tensors[1], certificate.error, certificate.valid, tables[1])
+    Distortion(basis.from_tensor(tensors[0]), shape, name, inverse, tables[0])  # checks the certificate
+    return correction_model(tensors[0], inverse, shape, tables[0])
 
 
 def _series(model):
@@ -171,10 +173,20 @@ def _series(model):
     return parts
 
 
+def _table(model):
+    """The table of a displacement model, of two `Tabular2D`, x and y; None if it has none."""
+    parts = [part for part in leaves(model) if isinstance(part, models.Tabular2D)]
+    if len(parts) not in (0, 2):
+        raise ValueError(f"the distortion should have two Tabular2D, x and y, or none, got {len(parts)}")
+    return DisplacementTable.from_models(*parts) if parts else None
+
+
 def _check_same(given, ours, shape):
-    """Raise if a model of a file does anything but add its two series."""
+    """Raise if a model of a file does anything but add its two series, and tables."""
     ny, nx = shape
     x, y = np.meshgrid(np.linspace(-0.5, nx - 0.5, 9), np.linspace(-0.5, ny - 0.5, 7))
     given.bounding_box = None
     if not np.allclose(given(x, y), ours(x, y), rtol=0, atol=1e-9):
-        raise ValueError("the distortion should be x, y plus two Legendre series over the detector, and is not")
+        raise ValueError(
+            "the distortion should be x, y plus two Legendre series, and tables, over the detector, and is not"
+        )

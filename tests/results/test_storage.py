@@ -432,7 +432,7 @@ def test_a_folded_solution_can_be_written(solution, tmp_path):
         (lambda e: e["inverse"].update(error_px=1e-7), "misses by .* where 1e-07 px was certified"),
         (
             lambda e: e["inverse"].update(error_px=0.5),
-            r"exposures\[1\]\.inverse\.error_px: 0.5; it should be finite, a number from 0 to 1e-06 .pix.$",
+            r"exposures\[1\]\.inverse\.error_px: 0.5; it should be finite, a number from 0 to 0.001 .pix.$",
         ),
         (lambda e: e["inverse"].update(valid_undistorted_px=[-1e6, 1e6, -1e6, 1e6]), "is stated to be valid in"),
         (lambda e: e.update(shape=[300, 501]), "misses by"),
@@ -528,7 +528,7 @@ def shifted(tree):
         (lambda m: m.update(inverse_error_px=2e-7), "misses by .* where 2e-07 px was certified"),
         (
             lambda m: m.update(inverse_error_px=2.0),
-            "entry meta.inverse_error_px: 2.0; it should be finite, a number from 0 to 1e-06",
+            "entry meta.inverse_error_px: 2.0; it should be finite, a number from 0 to 0.001",
         ),
         (lambda m: m.update(valid_undistorted_px=[0, 1, 2]), r"entry meta\.valid_undistorted_px: a list of 3; .* of 4"),
         (lambda m: m.update(valid_undistorted_px=[0.0, 1, 2, 3]), "is stated to be valid in"),

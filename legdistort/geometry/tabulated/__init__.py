@@ -1,0 +1,1 @@
+"""Displacements on a regular grid of nodes, for what no polynomial describes."""
