@@ -32,6 +32,7 @@ class Sky:
     amplitudes: np.ndarray
     odd: np.ndarray
     paths: object
+    dithers: np.ndarray
 
     @property
     def matches(self):
@@ -85,10 +86,11 @@ def sky(seed, *, refraction=0.0, phase=0.0, orbits=0.0, acceleration=0.0, n_star
         out[odd] += 0.5 * acceleration * time**2 * np.hstack([np.cos(angle[odd]), np.sin(angle[odd])])
         return out
 
-    parts = []
+    parts, dithers = [], np.zeros((n_exposures, 2))
     for i in range(n_exposures):
         time = years * (i // 2 * 2 / (n_exposures - 2) - 0.5) if years else 0.0
-        at = paths(time) + r.normal(0, 100, 2)
+        dithers[i] = r.normal(0, 100, 2)
+        at = paths(time) + dithers[i]
         seen = at + ((static + r.normal(0, 0.3, static.shape)) @ modes(at)).T
         seen = seen + refraction * np.tan(z[i]) * colour[:, None] * [np.sin(q[i]), np.cos(q[i])]
         if extra is not None:
@@ -105,4 +107,65 @@ def sky(seed, *, refraction=0.0, phase=0.0, orbits=0.0, acceleration=0.0, n_star
         part["epoch"] = np.full(len(inside), 2008.0 + time) * u.yr
         parts.append(part)
     table = QTable({name: np.concatenate([part[name] for part in parts]) for name in parts[0].colnames})
-    return Sky(table, stars, static, amplitudes, odd, paths)
+    return Sky(table, stars, static, amplitudes, odd, paths, dithers)
+
+
+@dataclass
+class Others:
+    """Stars of a `Sky` that took no part, in all exposures."""
+
+    table: QTable
+    stars: np.ndarray
+
+    def pull(self, solution):
+        """Mean square of what is wrong with them beyond the common cubic of the solution, in stated errors."""
+        row, error = np.asarray(solution.stars["star"]), solution.stars["x_err"].value[:, None]
+        xy = np.column_stack([solution.stars["x"].value, solution.stars["y"].value])
+        maps = modes(self.stars[row]).T
+        common = np.linalg.lstsq(maps / error, (xy - self.stars[row]) / error, rcond=None)[0]
+        squares = []
+        for name in solution.names:
+            rows = self.table[self.table["exposure"] == name]
+            measured = np.column_stack([rows["x"].value, rows["y"].value])
+            found = solution[name].correct(measured, errors=np.full(measured.shape, SIGMA))
+            true = self.stars[np.asarray(rows["star"])]
+            off = found.xy - true - modes(true).T @ common
+            squares.append(np.einsum("na,nab,nb->n", off, np.linalg.inv(found.relative), off) / 2)
+        return np.mean(np.concatenate(squares))
+
+
+def displaced_by(seed, displacements, n_stars, **how):
+    """A `Sky` with displacements by exposure, functions of the place, or None, and a third as many `Others`."""
+    extra = None if displacements is None else lambda i, at: displacements[i](at)
+    field = sky(seed, n_stars=n_stars + n_stars // 3, extra=extra, **how)
+    new = np.asarray(field.table["star"]) >= n_stars
+    others, field.table = Others(field.table[new], field.stars), field.table[~new]
+    return field, others
+
+
+def optimum(field, covariance):
+    """Least mean square error of the stars beyond a common cubic, of who knows the covariance of the displacements.
+
+    By generalised least squares of positions, poses and departures of 0.3 px; the slopes of distortions are left out.
+    """
+    star, names = np.asarray(field.table["star"]), np.unique(field.table["exposure"])
+    n, m, e = star.max() + 1, len(ORDERS), len(names)
+    normal = np.zeros((2 * (n + m * e),) * 2)
+    for i, name in enumerate(names):
+        at = star[field.table["exposure"] == name]
+        places = field.stars[at] + field.dithers[i]
+        inverse = np.linalg.inv(covariance(places, places) + SIGMA**2 * np.eye(2 * len(at)))
+        own = np.kron(modes(places).T, np.eye(2))
+        rows = (2 * at[:, None] + [0, 1]).ravel()
+        rows = np.concatenate([rows, 2 * (n + m * i) + np.arange(2 * m)])
+        design = np.hstack([np.eye(2 * len(at)), own])
+        known = np.repeat(np.where(np.arange(m) == 0, 0.0, 1 / 0.3**2), 2)
+        normal[np.ix_(rows, rows)] += design.T @ inverse @ design
+        normal[rows[-2 * m :], rows[-2 * m :]] += known
+    used = np.unique(star)
+    keep = np.concatenate([(2 * used[:, None] + [0, 1]).ravel(), np.arange(2 * n, len(normal))])
+    normal = normal[np.ix_(keep, keep)] + 1e-9 * np.eye(len(keep))
+    error = np.linalg.inv(normal)[: 2 * len(used), : 2 * len(used)]
+    maps = np.kron(modes(field.stars[used]).T, np.eye(2))
+    left = np.eye(len(maps)) - maps @ np.linalg.pinv(maps)
+    return np.trace(left @ error @ left.T) / len(maps)

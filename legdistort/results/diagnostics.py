@@ -325,7 +325,7 @@ class FittedTerm:
     owners, numbers : tuple of str
         Exposure or detector, and name, of every number.
     values, errors : tuple of float
-        In `unit`.
+        In `unit`; no errors of what describes a random field.
     """
 
     name: str
@@ -345,6 +345,12 @@ class FittedTerm:
         seen = f"twice the gain in log-likelihood {self.gain:.3g}"
         if not self.size:
             return f"{self.name}: the positions do not show it, it is left away"
+        if not self.errors:  # of a random field
+            shown = dict(zip(self.numbers, self.values, strict=True))
+            drawn = f", {shown['axis ratio']:.2g} times as long along {shown['angle']:.0f} deg from x"
+            what = f"a field of every exposure, {self.size:.2g} px over lengths of {shown['length']:.3g} px"
+            what += drawn * (shown["axis ratio"] > 1)
+            return f"{self.name}: {what}; it displaces positions by {self.rms:.2g} px rms per axis ({seen})"
         n, owners = len(self.values), list(dict.fromkeys(self.owners))
         if n == 1:
             what = f"{self.values[0]:.4g} +- {self.errors[0]:.2g} {self.unit} {self.numbers[0]}"

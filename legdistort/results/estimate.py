@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..geometry.distortion import Distortion
+from ..geometry.tabulated.covariance_table import CovarianceTable
 from ..geometry.tabulated.displacement_table import DisplacementTable
 from ..runtime.trees.facts import array
 from .errors.camera_errors import CameraErrors
@@ -50,6 +51,9 @@ class Estimate:
     displacement_tables, static_tables : dict
         ``{exposure: DisplacementTable}`` and ``{detector: DisplacementTable}``: what the distortion of an exposure has
         beside its series, of its own and of its detector. `table_of` is the sum.
+    table_errors : dict
+        ``{exposure: CovarianceTable}``: covariance of what is measured in an exposure with a random field, by the
+        errors of field and distortion together, relative to a common map.
     """
 
     star_names: np.ndarray
@@ -64,6 +68,7 @@ class Estimate:
     certified: dict[str, Distortion] = field(default_factory=dict, repr=False)
     displacement_tables: dict[str, DisplacementTable] = field(default_factory=dict)
     static_tables: dict[str, DisplacementTable] = field(default_factory=dict)
+    table_errors: dict[str, CovarianceTable] = field(default_factory=dict)
 
     def table_of(self, exposure: str, detector: str | None) -> DisplacementTable | None:
         """What an exposure has beside its series, by itself and by its detector; None for nothing."""

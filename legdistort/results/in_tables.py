@@ -104,7 +104,9 @@ def terms(solution):
     rows = [
         (each.name, owner, number, value, error, each.unit, each.size, each.gain)
         for each in solution.diagnostics.terms
-        for owner, number, value, error in zip(each.owners, each.numbers, each.values, each.errors, strict=True)
+        for owner, number, value, error in zip(
+            each.owners, each.numbers, each.values, each.errors or [np.nan] * len(each.values), strict=True
+        )
     ]
     names = ("term", "owner", "number", "value", "error", "unit", "size", "gain")
     return QTable(rows=rows or None, names=names, dtype=[str] * 3 + [float] * 2 + [str] + [float] * 2)

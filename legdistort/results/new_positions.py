@@ -209,8 +209,12 @@ def covariances(view, q, measured, moved=None):
     solution, i = view.solution, view.index
     gauge, uncertainty, positions = solution.gauge, solution.estimate.uncertainty, solution.estimate.positions
     by_modes, back = response(view, q)
-    noise = carried(back, measured) + by_camera(view, q, by_modes, back)
+    table = solution.estimate.table_errors.get(view.name)
+    noise = carried(back, measured) + (0 if table is not None else by_camera(view, q, by_modes, back))
+    # a random field and the distortion are known together
+    together = None if table is None else noise + carried(back, table(q))
     own = noise + carried(by_modes, absolute_errors.own_coefficients(gauge, uncertainty, i))
+    own = own if together is None else together
     if gauge.plane is not None:
         return own, np.full_like(own, np.nan)
     xy = similarity.apply(similarity.invert(solution.poses[view.name]), q)
@@ -221,6 +225,7 @@ def covariances(view, q, measured, moved=None):
     if len(hidden) == 2 * gauge.n_modes:
         directions = by_modes @ widened(gauge.motion[i], solution.degree)
         relative = relative + carried(directions - plain @ _taken_off(gauge, uncertainty, positions), hidden)
+    relative = relative if together is None else together
     if gauge.drift is not None and len(hidden) == 2 * gauge.n_modes:  # at the time of this exposure
         directions, hidden = by_modes @ widened(gauge.all_motion[i], solution.degree), gauge.joint_covariance
     if moved is not None:
@@ -250,6 +255,9 @@ def _taken_off(gauge, uncertainty, positions):
 def relative_errors(view, q):
     """Relative covariance (n, 2, 2) of the correction of positions q (n, 2) of an exposure."""
     by_modes, back = response(view, q)
+    table = view.solution.estimate.table_errors.get(view.name)
+    if table is not None:
+        return carried(back, table(q))
     own = absolute_errors.relative_coefficients(view.solution.gauge, view.solution.estimate.uncertainty, view.index)
     return carried(by_modes, own) + by_camera(view, q, by_modes, back)
 

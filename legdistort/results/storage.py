@@ -20,6 +20,7 @@ from ..cameras.camera import Camera
 from ..exceptions import FoldError, InputError
 from ..geometry import basis
 from ..geometry.distortion import Inverse
+from ..geometry.tabulated.covariance_table import CovarianceTable
 from ..geometry.tabulated.displacement_table import DisplacementTable
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
@@ -45,7 +46,11 @@ LAYOUT = 1
 #: Entry of a file under which a solution stands.
 ROOT = "legdistort"
 #: Entries by name that files of earlier versions lack.
-_TABLES = "displacement_tables", "static_tables"
+_TABLES = {
+    "displacement_tables": DisplacementTable,
+    "static_tables": DisplacementTable,
+    "table_errors": CovarianceTable,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,7 +185,7 @@ def _from_tree(kind, checksum, tree):
             motions=motions,
             checked=_part(tuple[Check, ...], tree, "checks", sizes),
             nights=_part(NightsFound | None, tree, "nights", sizes),
-            **{entry: _part(dict[str, DisplacementTable], tree, entry, sizes) for entry in _TABLES},
+            **{entry: _part(dict[str, of], tree, entry, sizes) for entry, of in _TABLES.items()},
         ),
         _checksum=checksum,
     )

@@ -572,7 +572,7 @@ def _solution(fit, scale, settings, diagnostics, form=None):
     uncertainty, matches = (fit.uncertainty if scale == 1 else fit.uncertainty_at(scale)), fit.matches
     if scale != 1 and matches.camera.has_focal_plane and uncertainty.camera is not None:
         matches = replace(matches, camera=with_errors_times(matches.camera, uncertainty.camera.free, scale))
-    return assemble(
+    solution = assemble(
         matches,
         fit.weighted,
         fit.result.state,
@@ -585,3 +585,8 @@ def _solution(fit, scale, settings, diagnostics, form=None):
         dof=fit.dof,
         form=form,
     )
+    if not fit.displacement_tables:
+        return solution
+    errors = {name: each.scaled(scale) for name, each in fit.table_errors.items()}
+    found = replace(solution.estimate, displacement_tables=fit.displacement_tables, table_errors=errors)
+    return replace(solution, estimate=found)

@@ -12,7 +12,7 @@ from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.geometry.zenith import stated_zenith
 from legdistort.runtime import words
-from legdistort.solving.terms.term import TERMS
+from legdistort.solving.terms.term import FIELDS, TERMS
 
 
 def test_refraction_is_taken_off():
@@ -203,7 +203,7 @@ def test_what_a_term_lacks_is_named():
 
 
 def test_the_command_knows_all_terms():
-    assert set(words.TERMS) == set(TERMS)
+    assert set(words.TERMS) == {*TERMS, *FIELDS}
 
 
 @pytest.mark.parametrize(

@@ -12,29 +12,27 @@ show is left away: a term, or of a term whose owners have sizes of their own (fe
 owner.
 """
 
-import contextlib
-import warnings
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from astropy import units as u
 from scipy import linalg
 from scipy.optimize import minimize_scalar
 
-from ...exceptions import ConvergenceWarning, LegdistortError, SolveError, warn
-from ...matching.matches import DISPLACED
+from ...exceptions import ConvergenceWarning, SolveError, warn
 from ...results.diagnostics import FittedTerm
 from ...results.errors.camera_errors import CameraErrors, unit_errors
 from ..equations.common_parts import followed, relative_responses, response
 from ..equations.elimination import inverse_star_blocks
 from ..equations.star_terms import unpacked
+from .displaced import FITS, SMALL, displaced, taken_off, unclipped
 from .observed import Observed
+from .term import FIELD_NUMBERS, RandomField
+from .turbulence import SHOWN as FIELD_SHOWN
+from .turbulence import fit_with_field
 
 #: Twice the gain in the logarithm of the likelihood from which a term is there.
 SHOWN = 4.0
-#: Fits at most, and the largest change of a number, in errors, at which they end.
-_FITS, _SMALL = 10, 0.02
 #: Chance that one of all owners with sizes of their own is called there that is not; sweeps over the sizes at most.
 _FALSE, _SWEEPS = 0.05, 300
 #: Part of that gain which an owner must show by itself to be looked at beside all others.
@@ -74,25 +72,38 @@ def fit_with(terms, estimate, matches, options, *how):
     if not terms:
         fit, *rest = estimate(matches, options, *how)
         return fit, lambda _: (), rest
-    values, begun = {}, _unclipped(estimate, matches, options, *how)
-    for number in range(_FITS):
+    if any(isinstance(term, RandomField) for term in terms):
+        return _fit_with_field(terms, estimate, matches, options, *how)
+    values, begun = {}, unclipped(estimate, matches, options, *how)
+    for number in range(FITS):
         fit, *rest = begun or estimate(matches, options, *how)
         begun = None
         numbers = _Numbers.of(terms, fit, values)
         step = numbers.step(fit, np.array([values.get(key, 0.0) for key in numbers.keys]))
         values = dict(zip(numbers.keys, step.values, strict=True))
-        if number and step.length < _SMALL:
+        if number and step.length < SMALL:
             break
-        matches = _displaced(fit, numbers.patterns @ step.values)
+        matches = displaced(fit, numbers.patterns @ step.values)
     else:
         warn(f"terms have not settled: the last change was {step.length:.2g} of an error", ConvergenceWarning)
     return _with_errors(fit, step, numbers), partial(numbers.found, step), rest
 
 
-def _unclipped(estimate, matches, options, *how):
-    """The estimate with all observations, for a beginning: what a term displaces far seems to deviate. None if none."""
-    with warnings.catch_warnings(action="ignore"), contextlib.suppress(LegdistortError):
-        return estimate(matches, replace(options, clip=None, errors="stated"), *how)
+def _fit_with_field(terms, estimate, matches, options, *how):
+    """`fit_with` of a random field alone."""
+    if len(terms) > 1:
+        others = " and ".join(term.name for term in terms if not isinstance(term, RandomField))
+        raise SolveError(f"turbulence cannot be found beside other terms yet: leave out {others}, or turbulence")
+    fit, field, rest = fit_with_field(estimate, matches, options, *how)
+    kernel, seen = field.kernel, field.gain >= FIELD_SHOWN
+    shown = seen * np.array([kernel.size, kernel.length, kernel.ratio, kernel.angle])
+    moved = taken_off(fit)
+    found = FittedTerm(
+        name=terms[0].name, unit=terms[0].unit, owner=terms[0].owner, size=float(shown[0]), gain=float(field.gain),
+        found=True, rms=float(np.sqrt(np.mean(moved**2))), n_asked=fit.problem.n_exposures,
+        owners=("",) * 4, numbers=FIELD_NUMBERS, values=tuple(shown.tolist()), errors=(),
+    )  # fmt: skip
+    return fit, lambda _: (found,), rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,14 +348,6 @@ def _owners(term, observed):
         return names.tolist(), number
     number = problem.detectors[observed.exposure]
     return [str(k + 1) for k in range(problem.detectors.max() + 1)], number
-
-
-def _displaced(fit, displacements):
-    """The matches of a fit with displacements (2, n), in the order of its problem, taken off their positions."""
-    table = fit.matches.table.copy(copy_data=False)
-    for name, values in zip(DISPLACED, fit.problem.in_table_order(displacements), strict=True):
-        table[name] = values * u.pix
-    return replace(fit.matches, table=table, observations=None)
 
 
 def _with_errors(fit, step, numbers):

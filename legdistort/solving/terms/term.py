@@ -156,6 +156,23 @@ def _checked(name, covariance, k):
     return covariance
 
 
+@dataclass(frozen=True)
+class RandomField:
+    """A smooth random field of displacements of every exposure, whose size, length and shape are found: turbulence."""
+
+    name: str = "turbulence"
+    unit: str = "pix"
+    owner: str = "exposure"
+
+    def check(self, table: Table) -> None:
+        """Nothing is needed of the table."""
+
+    def __repr__(self) -> str:
+        return f"<Term {self.name}: a random field of each exposure, {self.unit}>"
+
+
+#: What is told of a random field: its size and length [pix], axis ratio, and angle of its long axis from x [deg].
+FIELD_NUMBERS = "size", "length", "axis ratio", "angle"
 #: The terms that the package has, by name.
 TERMS = {
     "refraction": Term("refraction", refraction, ("towards zenith",), unit="pix per unit of colour",
@@ -165,6 +182,9 @@ TERMS = {
     "orbits": Term("orbits", orbits, PATHS["orbits"][0], owner="star", each=True, needs=("epoch",)),
     "pixel_phase": Term("pixel_phase", pixel_waves, PIXEL_WAVES, owner="detector"),
 }  # fmt: skip
+
+#: Random fields, by name.
+FIELDS = {"turbulence": RandomField()}
 
 
 def terms_of(given: str | Term | Iterable[str | Term] | None, table: Table) -> tuple[Term, ...]:
@@ -182,7 +202,7 @@ def terms_of(given: str | Term | Iterable[str | Term] | None, table: Table) -> t
     for term in each:
         if not isinstance(term, (str, Term)):
             raise InputError(f"terms must be names or Term objects, got {type(term).__name__}")
-        made.append(Term.named(term) if isinstance(term, str) else term)
+        made.append(FIELDS.get(term) or Term.named(term) if isinstance(term, str) else term)
     names = [term.name for term in made]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"the term {twice[0]!r} is given twice")
