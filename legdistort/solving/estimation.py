@@ -196,8 +196,8 @@ def solve(
         a reference, to the nearest 20 per cent, where no header has a WCS on the sky.
     terms : str, Term, or a list of them, optional
         What displaces stars beside the distortion, found with everything else and left away where the positions do not
-        show it: "refraction" by the colours of stars, "pixel_phase", or a `legdistort.Term` of one's own. In
-        `Solution.terms`.
+        show it: "refraction" by the colours of stars, "pixel_phase", "rough_static" (the static distortion beyond the
+        degree, as rough as it is), or a `legdistort.Term` of one's own. In `Solution.terms`.
     progress : bool
         Show a progress bar of the iterations where they take more than a second.
 
@@ -572,7 +572,7 @@ def _solution(fit, scale, settings, diagnostics, form=None):
     uncertainty, matches = (fit.uncertainty if scale == 1 else fit.uncertainty_at(scale)), fit.matches
     if scale != 1 and matches.camera.has_focal_plane and uncertainty.camera is not None:
         matches = replace(matches, camera=with_errors_times(matches.camera, uncertainty.camera.free, scale))
-    return assemble(
+    solution = assemble(
         matches,
         fit.weighted,
         fit.result.state,
@@ -585,3 +585,4 @@ def _solution(fit, scale, settings, diagnostics, form=None):
         dof=fit.dof,
         form=form,
     )
+    return solution if fit.tabled is None else fit.tabled.into(solution)

@@ -64,6 +64,8 @@ class Fit:
         Those of a camera that was fitted, or of the static distortion beyond the degree.
     shared_unknowns : float
         Number of unknowns of these that the data determine.
+    tabled : `legdistort.solving.terms.fitting.Tabled` or None
+        What terms found that is a part of distortions.
     """
 
     matches: Matches
@@ -76,6 +78,7 @@ class Fit:
     shared_errors: np.ndarray | None = None
     camera_errors: object = None
     shared_unknowns: float = 0.0
+    tabled: object = None
 
     @cached_property
     def weighted(self):
