@@ -113,10 +113,11 @@ class Distortion(ShownAsPrinted):
         ny, nx = self.shape
         return f"<Distortion{f' of {self.name}' if self.name else ''}: degree {self.degree}, {nx} x {ny} px>"
 
-    def same_as(self, other: Distortion) -> bool:
-        """Whether it is the same map of the same detector, to the last bit."""
-        alike = self.shape == other.shape and np.array_equal(self.coefficients, other.coefficients)
-        return alike and self.table == other.table
+    def same_as(self, other: Distortion, *, rounding: float = 0.0) -> bool:
+        """Whether it is the same map of the same detector: to the last bit, or coefficients to a rounding, pixels."""
+        if self.shape != other.shape or self.coefficients.shape != other.coefficients.shape:
+            return False
+        return np.abs(self.coefficients - other.coefficients).max() <= rounding and self.table == other.table
 
     def __call__(self, q: ArrayLike) -> np.ndarray:
         """Undistorted pixels (n, 2) -> detector pixels (n, 2)."""

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from ..exceptions import some_of
+from ..geometry.tabulated.rough_basis import RoughBasis
 from ..inputs import column_contract
 from ..runtime.trees.facts import YEARS, number, text
 from .errors.header_pointing import HeaderPointing
@@ -326,6 +327,9 @@ class FittedTerm:
         Exposure or detector, and name, of every number.
     values, errors : tuple of float
         In `unit`; no errors of what describes a random field.
+    bases : tuple of RoughBasis
+        Of every detector, in the order of the owners, where the term is a part of their distortions: its functions, at
+        undistorted pixels, of which half of the numbers are displacements along x, then along y.
     """
 
     name: str
@@ -340,6 +344,7 @@ class FittedTerm:
     numbers: tuple[str, ...]
     values: tuple[float, ...]
     errors: tuple[float, ...] = field(metadata=_SCALE)
+    bases: tuple[RoughBasis, ...] = ()
 
     def __str__(self) -> str:
         seen = f"twice the gain in log-likelihood {self.gain:.3g}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -74,6 +74,18 @@ class Estimate:
         """What an exposure has beside its series, by itself and by its detector; None for nothing."""
         own, static = self.displacement_tables.get(exposure), self.static_tables.get(detector or "")
         return own + static if own is not None and static is not None else static if own is None else own
+
+    def certified_as(self, made: Distortion) -> Distortion:
+        """The distortion of an exposure as it was made before, or with the inverse of another that is the same map."""
+        known = self.certified.get(made.name)
+        if known is not None and known.same_as(made):
+            return known
+        for each in self.certified.values() if made.table is not None else ():  # their inverses take long
+            if "inverse" in vars(each) and each.same_as(made, rounding=1e-12):
+                made = replace(made, certified=each.inverse)
+                break
+        self.certified[made.name] = made
+        return made
 
 
 @dataclass(frozen=True, eq=False)

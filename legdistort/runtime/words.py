@@ -20,7 +20,7 @@ GAUGES = ("minimal", "mean")
 LOSSES = ("linear", "huber", "cauchy")
 ERRORS = ("stated", "scale", "floor", "by-brightness", "correlated")
 MOTIONS = ("proper", "parallax", "auto")
-TERMS = ("refraction", "pixel_phase", "acceleration", "orbits", "turbulence")
+TERMS = ("refraction", "pixel_phase", "acceleration", "orbits", "rough_static", "turbulence")
 #: What is done about layouts and static distortions of a camera; without one a static distortion can only be fitted.
 CAMERA = ("hold", "prior", "fit")
 #: What of a camera has a distortion of its own in every exposure.

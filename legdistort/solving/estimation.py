@@ -196,8 +196,8 @@ def solve(
         a reference, to the nearest 20 per cent, where no header has a WCS on the sky.
     terms : str, Term, or a list of them, optional
         What displaces stars beside the distortion, found with everything else and left away where the positions do not
-        show it: "refraction" by the colours of stars, "pixel_phase", or a `legdistort.Term` of one's own. In
-        `Solution.terms`.
+        show it: "refraction" by the colours of stars, "pixel_phase", "rough_static" (the static distortion beyond the
+        degree, as rough as it is), "turbulence" (a random field of every exposure), or a `legdistort.Term` of one's own. In `Solution.terms`.
     progress : bool
         Show a progress bar of the iterations where they take more than a second.
 
@@ -585,8 +585,4 @@ def _solution(fit, scale, settings, diagnostics, form=None):
         dof=fit.dof,
         form=form,
     )
-    if not fit.displacement_tables:
-        return solution
-    errors = {name: each.scaled(scale) for name, each in fit.table_errors.items()}
-    found = replace(solution.estimate, displacement_tables=fit.displacement_tables, table_errors=errors)
-    return replace(solution, estimate=found)
+    return solution if fit.tabled is None else fit.tabled.into(solution, scale)

@@ -64,8 +64,8 @@ class Fit:
         Those of a camera that was fitted, or of the static distortion beyond the degree.
     shared_unknowns : float
         Number of unknowns of these that the data determine.
-    displacement_tables, table_errors : dict
-        By exposure, of random fields: `DisplacementTable`, and `CovarianceTable` of what is measured in it.
+    tabled : `legdistort.solving.terms.displaced.Tabled` or None
+        What terms found that is a part of distortions.
     """
 
     matches: Matches
@@ -78,8 +78,7 @@ class Fit:
     shared_errors: np.ndarray | None = None
     camera_errors: object = None
     shared_unknowns: float = 0.0
-    displacement_tables: dict = field(default_factory=dict)
-    table_errors: dict = field(default_factory=dict)
+    tabled: object = None
 
     @cached_property
     def weighted(self):

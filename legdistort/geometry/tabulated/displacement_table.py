@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 #: Cells along an axis, at most.
 MOST_CELLS = 1024
 #: Nodes beyond the detector on every side, by its longer side: undistorted pixels reach there.
-_MARGIN = 1 / 64
+MARGIN = 1 / 64
 #: Irregularity of the nodes of a model, by their distance.
 _IRREGULAR = 1e-9
 
@@ -73,7 +73,7 @@ class DisplacementTable:
         shape: tuple[int, int],
         step: float | tuple[float, float],
         *,
-        margin: float = _MARGIN,
+        margin: float = MARGIN,
     ) -> DisplacementTable:
         """Tabulate displacements over a detector.
 

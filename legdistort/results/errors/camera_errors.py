@@ -123,6 +123,24 @@ class CameraErrors:
         In the focal plane, where there is one, on the detector of the view or else on that on which each falls; zero
         off all detectors.
         """
+        return self._of_modes(view, q) - self._of_terms(view, q)
+
+    def _of_terms(self, view, q):
+        """How terms that are a part of the distortion displace what is at undistorted pixels q (n, 2), (n, 2, r)."""
+        first, out = 0, np.zeros((len(q), 2, self.changes.shape[1]))
+        for term in view.solution.diagnostics.terms:
+            owners = dict.fromkeys(term.owners)
+            for functions, owner in zip(term.bases, owners, strict=False):
+                rows = slice(first, first + 2 * functions.n)
+                if term.size and owner == view.detectors[0]:
+                    numbers = self.numbers[rows].reshape(2, functions.n, -1)
+                    out += np.einsum("anr->nar", functions(q) @ numbers)
+                first = rows.stop
+            first += 0 if term.bases else len(term.values)
+        return out
+
+    def _of_modes(self, view, q):
+        """What `of_measured` gives, of the modes that were fitted."""
         if not len(self.changes):
             return np.zeros((len(q), 2, self.changes.shape[1]))
         changes = np.zeros((*self.free.shape, self.changes.shape[1]))

@@ -46,16 +46,15 @@ def followed(respond, problem, blocks, patterns):
     patterns : ndarray, shape (2, n, k)
     """
     moved, k = _weighted(problem, patterns), patterns.shape[2]
-    normal = np.einsum("ank,anl->kl", patterns, moved)
+    normal = np.tensordot(patterns, moved, ((0, 1), (0, 1)))
     alone = np.diag(normal).copy()
     stars = np.empty((*blocks.g_star.shape, k))
     coefficients = np.empty((*blocks.g_exposure.shape, k))
     gradients = [_gradient(problem, blocks, patterns[:, :, j], moved[:, :, j]) for j in range(k)]
     whole = np.array([np.concatenate([each.ravel() for each in pair]) for pair in gradients]).reshape(k, -1)
     for j, pair in enumerate(gradients):
-        star_response, response = respond(*pair)
-        stars[:, :, j], coefficients[:, :, j] = star_response, response
-        normal[:, j] -= whole @ np.concatenate([response.ravel(), star_response.ravel()])
+        stars[:, :, j], coefficients[:, :, j] = respond(*pair)
+    normal -= whole @ np.concatenate([coefficients.reshape(-1, k), stars.reshape(-1, k)])
     pull = -np.einsum("ank,an->k", moved, blocks.residual)
     return Followed(stars, coefficients, (normal + normal.T) / 2, alone, pull)
 

@@ -2,7 +2,7 @@
 
 import contextlib
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from astropy import units as u
@@ -34,3 +34,32 @@ def taken_off(fit):
     if DISPLACED[0] not in table.colnames:
         return np.zeros_like(fit.problem.xy)
     return np.stack([table[name].to_value(u.pix)[fit.problem.order] for name in DISPLACED])
+
+
+@dataclass(frozen=True, eq=False)
+class Tabled:
+    """What terms found that is a part of distortions.
+
+    Attributes
+    ----------
+    beside : ndarray, shape (2, n)
+        What all other terms displace the observations by, in the order of the table, pixels.
+    static, own : dict
+        ``{detector: DisplacementTable}`` and ``{exposure: DisplacementTable}``.
+    errors : dict
+        ``{exposure: CovarianceTable}`` of what is measured, distortion and table together.
+    """
+
+    beside: np.ndarray
+    static: dict = field(default_factory=dict)
+    own: dict = field(default_factory=dict)
+    errors: dict = field(default_factory=dict)
+
+    def into(self, solution, scale):
+        """A solution with it in its distortions, no more in what terms displace measured positions by."""
+        table = solution.residuals.copy(copy_data=False)
+        for name, values in zip(DISPLACED, self.beside, strict=True):
+            table[name] = values * u.pix
+        errors = {name: each.scaled(scale) for name, each in self.errors.items()}
+        tables = {"static_tables": self.static, "displacement_tables": self.own, "table_errors": errors}
+        return replace(solution, residuals=table, estimate=replace(solution.estimate, **tables))

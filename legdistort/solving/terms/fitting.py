@@ -25,7 +25,7 @@ from ...results.errors.camera_errors import CameraErrors, unit_errors
 from ..equations.common_parts import followed, relative_responses, response
 from ..equations.elimination import inverse_star_blocks
 from ..equations.star_terms import unpacked
-from .displaced import FITS, SMALL, displaced, taken_off, unclipped
+from .displaced import FITS, SMALL, Tabled, displaced, taken_off, unclipped
 from .observed import Observed
 from .term import FIELD_NUMBERS, RandomField
 from .turbulence import SHOWN as FIELD_SHOWN
@@ -79,14 +79,16 @@ def fit_with(terms, estimate, matches, options, *how):
         fit, *rest = begun or estimate(matches, options, *how)
         begun = None
         numbers = _Numbers.of(terms, fit, values)
-        step = numbers.step(fit, np.array([values.get(key, 0.0) for key in numbers.keys]))
+        taken = np.array([values.get(key, 0.0) for key in numbers.keys])
+        step = numbers.step(fit, taken)
         values = dict(zip(numbers.keys, step.values, strict=True))
         if number and step.length < SMALL:
             break
         matches = displaced(fit, numbers.patterns @ step.values)
     else:
         warn(f"terms have not settled: the last change was {step.length:.2g} of an error", ConvergenceWarning)
-    return _with_errors(fit, step, numbers), partial(numbers.found, step), rest
+    fit = replace(_with_errors(fit, step, numbers), tabled=numbers.tabled(fit, taken))
+    return fit, partial(numbers.found, step), rest
 
 
 def _fit_with_field(terms, estimate, matches, options, *how):
@@ -144,8 +146,10 @@ class _Numbers:
     group : ndarray of int, shape (k,)
         What has a size of its own: the term of every number, or its owner.
     term_of : ndarray of int, shape (n_groups,)
-    root : ndarray, shape (k, k)
-        Square root of their covariance where every size is 1.
+    bases : list of tuple
+        Of every term, its functions of the place by owner, where it is a part of distortions; else empty.
+    root : ndarray, shape (k, k), or None
+        Square root of their covariance where every size is 1; None for independent ones.
     patterns : ndarray, shape (2, n, k)
         Displacements by a unit of each, in the order of the problem.
     """
@@ -155,14 +159,16 @@ class _Numbers:
     n_owners: list
     group: np.ndarray
     term_of: np.ndarray
-    root: np.ndarray
+    bases: list
+    root: np.ndarray | None
     patterns: np.ndarray
 
     @classmethod
     def of(cls, terms, fit, values):
         """Those of some terms in the observations of a `Fit`, made with values ``{key: value}`` of them."""
-        keys, n_owners, sizes, roots, patterns = [], [], [], [], []
-        for term, names, owner, columns, known in _made(terms, fit, values):
+        keys, n_owners, sizes, roots, patterns, bases = [], [], [], [], [], []
+        for term, names, owner, columns, known, functions in _made(terms, fit, values):
+            bases.append(functions)
             asked = _asked(fit, term, owner, columns, known) if term.each else np.arange(len(names))
             k, n = len(term.numbers), len(asked)
             if 2 * k * n * len(owner) > _VALUES or k * n > _MOST:
@@ -182,7 +188,8 @@ class _Numbers:
             roots += [np.eye(k) if term.covariance is None else np.linalg.cholesky(term.covariance)] * n
         term_of = np.repeat(np.arange(len(terms)), list(map(len, sizes)))
         group = np.repeat(np.arange(len(term_of)), np.concatenate(sizes).astype(int))
-        return cls(terms, keys, n_owners, group, term_of, linalg.block_diag(*roots), np.concatenate(patterns, axis=2))
+        root = None if all(term.covariance is None for term in terms) else linalg.block_diag(*roots)
+        return cls(terms, keys, n_owners, group, term_of, bases, root, np.concatenate(patterns, axis=2))
 
     def step(self, fit, values):
         """The `_Step` from a fit with the numbers at some values (k,)."""
@@ -190,11 +197,14 @@ class _Numbers:
             return _Step(values, np.zeros((0, 0)), np.zeros(0), np.zeros(0), 0.0, None)
         solve = response(fit.uncertainty.system, fit.result.gauge)
         follow = followed(solve, fit.weighted, fit.blocks, -self.patterns)  # what a term displaces is taken off
-        normal, pull = (self.root.T @ follow.normal @ self.root, self.root.T @ (follow.pull + follow.normal @ values))
+        normal, pull = follow.normal, follow.pull + follow.normal @ values
+        if self.root is not None:
+            normal, pull = self.root.T @ normal @ self.root, self.root.T @ pull
         sizes, gains = self._sizes(normal, pull)
         scale = sizes[self.group]
-        covariance, rest = _posterior(normal, pull, scale)
-        covariance, new = self.root @ covariance @ self.root.T, self.root @ rest
+        covariance, new = _posterior(normal, pull, scale)
+        if self.root is not None:
+            covariance, new = self.root @ covariance @ self.root.T, self.root @ new
         error, moved = np.sqrt(np.diag(covariance)), np.abs(new - values)
         length = np.max(np.divide(moved, error, out=np.where(moved > 0, np.inf, 0.0), where=error > 0), initial=0.0)
         return _Step(new, covariance, sizes, gains, float(length), follow)
@@ -206,13 +216,17 @@ class _Numbers:
         unit = np.array([1 / np.sqrt(max(np.median(np.diag(normal)[mine]), 1e-300)) for mine in rows])
         given = np.array([np.nan if self.terms[t].sigma is None else float(self.terms[t].sigma) for t in self.term_of])
         given, sought = np.where(np.isinf(given), _FREE * unit, given), np.isnan(given)
-        sizes = np.where(sought, 0.0, given)
+        sizes, known = np.where(sought, 0.0, given), {}
 
         def best(groups):
             """The best size of each beside the others, and its gain."""
             there = sizes[self.group] * ~np.isin(self.group, groups)
-            left, pulled = _left(normal, pull, there)
-            return [_best_size(left[np.ix_(rows[g], rows[g])], pulled[rows[g]], unit[g], given[g]) for g in groups]
+            key = (*groups, there.tobytes())
+            if key not in known:
+                left, pulled = _left(normal, pull, there)
+                parts = [(left[np.ix_(rows[g], rows[g])], pulled[rows[g]]) for g in groups]
+                known[key] = [_best_size(*part, unit[g], given[g]) for part, g in zip(parts, groups, strict=True)]
+            return known[key]
 
         for _ in range(_SWEEPS):
             last = sizes.copy()
@@ -234,6 +248,19 @@ class _Numbers:
         every = np.flatnonzero(self.term_of[self.group] == t)
         return every[step.sizes[self.group[every]] > 0] if self.terms[t].each else every
 
+    def tabled(self, fit, values):
+        """What is a part of distortions, as `Tabled`, with the values (k,) in a `Fit`; None for nothing."""
+        static, beside = {}, np.array(values)
+        for t, functions in enumerate(self.bases):
+            every = np.flatnonzero(self.term_of[self.group] == t)
+            if not functions or not values[every].any():
+                continue
+            beside[every] = 0
+            owners = dict.fromkeys(self.keys[k][1] for k in every)
+            for each, owner, mine in zip(functions, owners, np.split(values[every], len(owners)), strict=True):
+                static[owner] = each.table(mine.reshape(2, -1))
+        return Tabled(fit.problem.in_table_order(self.patterns @ beside), static) if static else None
+
     def found(self, step, scale):
         """The `FittedTerm` of every term, with errors times a factor."""
         error, moved = scale * np.sqrt(np.diag(step.covariance)), []
@@ -250,6 +277,7 @@ class _Numbers:
                     n_asked=self.n_owners[t] if term.each else len({self.keys[k][1] for k in every}),
                     owners=tuple(self.keys[k][1] for k in shown), numbers=tuple(self.keys[k][2] for k in shown),
                     values=tuple(step.values[shown].tolist()), errors=tuple(error[shown].tolist()),
+                    bases=self.bases[t],
                 )
             )  # fmt: skip
         return tuple(moved)
@@ -294,6 +322,8 @@ def _posterior(normal, pull, scale):
 def _made(terms, fit, values):
     """Of every term: itself, names of its owners, that of every observation (n,), columns (k, 2, n), values by owner.
 
+    And the functions of the place by owner, where it is a part of distortions.
+
     Where a star falls on a pixel is known from the model, without the term itself, better than from its position.
     """
     problem, matches = fit.problem, fit.matches
@@ -310,8 +340,17 @@ def _made(terms, fit, values):
             known = np.array([[values.get((term.name, name, each), 0.0) for each in term.numbers] for name in names])
             columns = term.displacements(replace(observed, beside=off - moved.sum(axis=0) + moved[t]))
             moved[t] = np.einsum("kan,nk->an", columns, known[owner])
-            made.append((term, names, owner, columns, known))
+            made.append((term, names, owner, columns, known, _bases(term, names, owner, observed)))
     return made
+
+
+def _bases(term, names, owner, observed):
+    """Of every owner the functions of the place, where a term is a part of distortions; else none."""
+    basis, problem = getattr(term.columns, "basis", None), observed.problem
+    if basis is None:
+        return ()
+    first = [observed.exposure[np.flatnonzero(owner == j)[0]] for j in range(len(names))]
+    return tuple(basis(observed, problem.shapes[i]) for i in first)
 
 
 def _asked(fit, term, owner, columns, known):
@@ -346,8 +385,10 @@ def _owners(term, observed):
     if "detector" in observed.table.colnames:
         names, number = np.unique(np.asarray(observed.table["detector"]).astype(str), return_inverse=True)
         return names.tolist(), number
-    number = problem.detectors[observed.exposure]
-    return [str(k + 1) for k in range(problem.detectors.max() + 1)], number
+    number, n = problem.detectors[observed.exposure], int(problem.detectors.max()) + 1
+    if observed.camera is not None and len(observed.camera.detectors) == n:
+        return list(observed.camera.detectors), number
+    return [str(k + 1) for k in range(n)], number
 
 
 def _with_errors(fit, step, numbers):

@@ -70,6 +70,14 @@ class Observed:
         return np.stack([np.asarray(self.table[name].value, dtype=float) for name in names])
 
     @cached_property
+    def undistorted(self):
+        """Undistorted pixels of the observations by the model, (n, 2): where distortions act."""
+        problem, state = self.problem, self.state
+        x, y = problem.placed_at(self.exposure, state.stars[:, problem.star])
+        one = np.ones_like(x)
+        return np.einsum("nab,bn->na", state.poses[self.exposure], np.stack([x, y, one]))
+
+    @cached_property
     def places_alone(self):
         """Positions on the detectors as they would be measured without errors and without the term, pixels, (2, n)."""
         return self.pixels - self._turned(np.broadcast_to(self.beside, self.pixels.shape), inverse=False)

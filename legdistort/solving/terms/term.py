@@ -14,6 +14,7 @@ from ...inputs.column_contract import colour_column
 from ...results.motions import PATHS
 from ...runtime.checks import check_choice
 from .displacements import PIXEL_WAVES, accelerations, orbits, pixel_waves, refraction
+from .rough import RoughColumns, names
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -37,7 +38,8 @@ class Term:
     columns : callable
         ``columns(observed)`` gives displacements (k, 2, n) of the n positions by a unit of each of the k numbers,
         pixels. `observed` (`legdistort.solving.terms.observed.Observed`) has ``pixels`` (2, n), ``place`` (the same
-        from -1 to 1), ``exposure`` (n,), the ``table`` with all columns that were given, and more.
+        from -1 to 1), ``exposure`` (n,), the ``table`` with all columns that were given, and more. With a method
+        ``basis`` it is a part of the distortion of its detector, in a table (`RoughColumns`).
     numbers : tuple of str
         Names of the k numbers.
     unit : str
@@ -98,7 +100,8 @@ class Term:
     def named(cls, name: str, **changed: Any) -> Term:
         """A term that the package has, perhaps with attributes changed.
 
-        "refraction", "pixel_phase", "acceleration" (of a star, constant), "orbits" (any smooth path, once round).
+        "refraction", "pixel_phase", "acceleration" (of a star, constant), "orbits" (any smooth path, once round),
+        "rough_static" (what the static distortion of a detector has beyond the degree).
 
         Raises
         ------
@@ -122,6 +125,11 @@ class Term:
                 "place, time and site"
             )
         raise InputError(f"term {self.name}: {what}; {cure}")
+
+    def for_table(self, table: Table) -> Term:
+        """The term with as many numbers as a table of positions asks for, where that is not said."""
+        sized = getattr(self.columns, "for_table", None)
+        return self if sized is None else replace(self, **sized(table))
 
     def displacements(self, observed: Any) -> np.ndarray:
         """Displacements (k, 2, n), checked.
@@ -167,6 +175,10 @@ class RandomField:
     def check(self, table: Table) -> None:
         """Nothing is needed of the table."""
 
+    def for_table(self, table: Table) -> RandomField:
+        """The same for every table."""
+        return self
+
     def __repr__(self) -> str:
         return f"<Term {self.name}: a random field of each exposure, {self.unit}>"
 
@@ -181,6 +193,7 @@ TERMS = {
                          each=True, needs=("epoch",)),
     "orbits": Term("orbits", orbits, PATHS["orbits"][0], owner="star", each=True, needs=("epoch",)),
     "pixel_phase": Term("pixel_phase", pixel_waves, PIXEL_WAVES, owner="detector"),
+    "rough_static": Term("rough_static", RoughColumns(20), names(20), owner="detector"),
 }  # fmt: skip
 
 #: Random fields, by name.
@@ -208,4 +221,4 @@ def terms_of(given: str | Term | Iterable[str | Term] | None, table: Table) -> t
         raise InputError(f"the term {twice[0]!r} is given twice")
     for term in made:
         term.check(table)
-    return tuple(made)
+    return tuple(term.for_table(table) for term in made)

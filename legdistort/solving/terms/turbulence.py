@@ -23,7 +23,7 @@ from ...geometry.tabulated.displacement_table import DisplacementTable
 from ...results.errors.camera_errors import CameraErrors, unit_errors
 from ..equations.common_parts import Followed, relative_responses, response
 from ..equations.star_terms import unpacked
-from .displaced import SMALL, displaced, taken_off, unclipped
+from .displaced import SMALL, Tabled, displaced, taken_off, unclipped
 from .random_field import Seen, most_likely
 
 #: Twice the gain in the logarithm of the likelihood from which a field is there: some numbers of it are sought.
@@ -412,6 +412,5 @@ def _with_field(fit, field):
         fit,
         camera_errors=known.beside(*added, np.zeros((0, added[0].shape[2]))),
         shared_unknowns=fit.shared_unknowns + fit.dof - field.dof,
-        displacement_tables=tables,
-        table_errors=errors,
+        tabled=Tabled(np.zeros_like(problem.xy), own=tables, errors=errors),
     )
