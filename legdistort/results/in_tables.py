@@ -151,6 +151,7 @@ def _meta(solution):
         "epoch": epoch(solution),
         "gauge": solution.gauge.kind,
         "degree": solution.degree,
+        "pixel_scale": pixel_scale(solution),
         "prior": None if solution.settings.prior is None else str(prior or "given"),
         "version": f"legdistort {solution.provenance.get('versions', {}).get('legdistort', '')}".strip(),
     }
@@ -163,16 +164,21 @@ def rms(solution):
     return np.array([np.sqrt(np.mean(solution.residuals[d][used].to_value(u.pix) ** 2)) for d in ("dx", "dy")])
 
 
+def pixel_scale(solution):
+    """Arcsec a pixel where that was stated, by the sky if there is one; else None."""
+    stated = solution.settings.pixel_scale
+    return None if stated is None else float(stated if solution.sky is None else solution.sky.pixel_scale)
+
+
 def in_mas(solution):
     """Figures in mas where a pixel scale was stated, by that of the sky if there is one; else None.
 
     ``pixel_scale_arcsec``; ``rms_mas``, residuals per axis; medians over the stars of ``error_mas``, ``error_abs_mas``,
     ``motion_error_mas_yr``, ``motion_error_abs_mas_yr``: None where nothing is known.
     """
-    scale = solution.settings.pixel_scale
+    scale = pixel_scale(solution)
     if scale is None:
         return None
-    scale = float(scale if solution.sky is None else solution.sky.pixel_scale)
     stars, found = (
         solution.stars,
         {"pixel_scale_arcsec": scale, "rms_mas": 1000 * scale * float(np.sqrt(np.mean(rms(solution) ** 2)))},
