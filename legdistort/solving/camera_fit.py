@@ -367,7 +367,8 @@ def _tell_unknown(matches, step, unknown):
         f"{len(unknown)} unknowns of camera {camera.name} are not determined by these exposures and stay where they "
         f"were, above all of detector {', '.join(named)}{apart}: stars that one detector sees in one exposure and "
         "another in the next determine how these lie; dither over the gaps, or say how well the layout is known "
-        "(layout_sigma)",
+        "(layout_sigma); if these dithers are larger than the gaps, the layout is too far off to find such stars "
+        "(camera=, --camera)",
         AssumptionWarning,
     )
 

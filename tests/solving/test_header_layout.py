@@ -125,6 +125,13 @@ def test_the_check_of_absolute_positions_names_what_cures_it(near, name):
     assert after.state == "pass"
 
 
+def test_no_width_is_offered_of_a_layout_that_is_to_be_found_without(near):
+    """--layout fit with --layout-sigma is refused: the check led there."""
+    check = next(check for check in legdistort.solve(near[1], layout="fit").checks if check.name == "absolute")
+    assert "--pose-sigma" in check.cure
+    assert "--layout-sigma" not in check.cure
+
+
 def test_held(near):
     """As exact: the stars do not agree with it, and that is said."""
     solution = legdistort.solve(near[1], layout="hold")
@@ -159,6 +166,22 @@ def test_what_no_star_ties_is_not_determined(apart, groups):
             assert "1 | 2 | 3 | 4" in check.sentence
             assert "dithers larger than the gaps" in check.cure
     assert groups.camera["2"].place.errors == (np.inf,) * 3
+
+
+def test_a_layout_that_hides_the_stars_that_cross_is_named():
+    """Farther off than these are looked for: that was blamed on the dithers, which are three times the gaps."""
+    night = header_layouts.Night(2, off=2.0, turn=0.05, odd=(70.0, 0.0, 0.0))
+    with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        solution = legdistort.solve(legdistort.match(night.table, exposures=night.exposures))
+    assert ties.apart(solution.camera, solution.residuals).endswith("1, 2, 4 | 3")
+    check = next(check for check in solution.checks if check.name == "camera")
+    assert check.state == "warn"
+    assert re.search(
+        r"1, 2, 4 \| 3\), but by the layout \d+ stars are seen by several of them: it may be wrong", check.sentence
+    )
+    assert check.cure.startswith("a layout that is nearer, by better headers or a camera file (--camera)")
+    absolute = next(check for check in solution.checks if check.name == "absolute")
+    assert "if these dithers are larger than the gaps: stars are looked for to 60 px and 1 degree" in absolute.cure
 
 
 def with_false_ties(matches, n):

@@ -345,7 +345,7 @@ def _by_headers(solution, unknown):
         return ""
     words = "; or say how well headers know the poses (--pose-sigma shift=PIXELS,rotation=DEGREES)"
     free = camera is not None and camera.headers is not None and settings.layout_sigma is None
-    if free and settings.layout != "hold" and unknown == ("shear",):
+    if free and settings.layout in (None, "prior") and unknown == ("shear",):
         words += " or the layout (--layout-sigma shift=PIXELS,rotation=DEGREES)"
     return words
 
