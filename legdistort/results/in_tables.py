@@ -327,10 +327,13 @@ _RMS = "dx", "dy"
 
 def layout_errors(solution):
     """What the errors of a layout that was fitted leave out, in words; empty where none was."""
-    errors = solution.estimate.uncertainty.camera
-    if errors is None or not solution.camera.has_focal_plane or not (free := errors.free.any(axis=(0, 1)))[:3].any():
+    errors, common = solution.estimate.uncertainty.camera, solution.camera.common_sigma
+    if errors is None or not solution.camera.has_focal_plane or not errors.free[:, :, :3].any():
         return ""
-    degree = basis.degree_of(np.count_nonzero(free)) if free[:3].all() else 1
+    degree = 1
+    if common is not None:  # infinite where exposures take over what detectors have in common
+        orders = np.add(*basis.orders(basis.degree_of(common.shape[1])))
+        degree = orders[np.isinf(common).any(axis=0)].max(initial=1)
     which = "one affine map" if degree < 2 else f"one map of degree {degree}"
     unknown = f", and {solution.gauge.unknown_in_words}" if solution.gauge.unknown_names else ""
     return (

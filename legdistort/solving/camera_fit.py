@@ -36,6 +36,8 @@ _SHIFT_WEIGHT, _LAYOUT_WEIGHT = 0.003, 0.03
 _STATED_SHIFT, _STATED_LAYOUT = 0.1, 10.0
 #: Part of a direction that may be left of it where it counts as one of several.
 _LIES_IN = 0.3
+#: Part of the largest unknown of a direction that is rounding: the direction has nothing of an unknown with less.
+_ROUNDED = 1e-6
 #: Layouts that agree so well [pix] are the same.
 _SAME = 1e-6
 #: Steps at most, and their length in standard errors at which they end.
@@ -314,7 +316,8 @@ def _groups(fit):
 def _unknown(camera, step):
     """Directions (m, k), of unit rms over the unknowns, that are not determined and no exposure can take over."""
     exchanged = _exchanged(camera, step.free)
-    scale = np.abs(step.weak).max(axis=0, initial=0) + np.finfo(float).tiny
+    scale = np.abs(step.weak).max(axis=0, initial=0)
+    scale = np.maximum(scale, max(_ROUNDED * scale.max(initial=0), np.finfo(float).tiny))
     weak, common = (
         step.weak / scale,
         np.linalg.qr((exchanged / scale).T)[0] if len(exchanged) else np.zeros((len(scale), 0)),

@@ -12,6 +12,7 @@ from astropy.table import Table
 import legdistort
 from legdistort.cameras import ties
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortWarning
+from legdistort.solving.camera_fit import in_camera
 
 STATES = ("camera", "absolute")
 
@@ -182,6 +183,38 @@ def test_a_layout_that_hides_the_stars_that_cross_is_named():
     assert check.cure.startswith("a layout that is nearer, by better headers or a camera file (--camera)")
     absolute = next(check for check in solution.checks if check.name == "absolute")
     assert "if these dithers are larger than the gaps: stars are looked for to 60 px and 1 degree" in absolute.cure
+
+
+def with_drawn_statics(night, seed, sigma=0.3):
+    """Matches of a camera that states static distortions which are off by their widths; there are none."""
+    matches, rng = legdistort.match(night.table, exposures=night.exposures), np.random.default_rng(seed)
+    statics = np.concatenate([np.zeros((4, 2, 3)), rng.normal(0, sigma, (4, 2, 7))], axis=2)
+    detectors = {key: replace(each, static=static, static_sigma=sigma)
+                 for (key, each), static in zip(matches.camera.detectors.items(), statics, strict=True)}  # fmt: skip
+    return in_camera(matches, replace(matches.camera, detectors=detectors))
+
+
+def test_a_layout_beside_statics_with_widths_is_determined():
+    """Rounding was taken for a direction that is not: errors were infinite, and a wrong header went into the sky."""
+    night = header_layouts.Night(2, off=2.0, turn=0.05, n=7, n_stars=250, odd=(22.0, -24.0, 0.6))
+    solution = legdistort.solve(with_drawn_statics(night, 2), layout="fit", static="prior")
+    errors = np.array([solution.camera[key].place.errors[:2] for key in header_layouts.KEYS])
+    assert np.all((errors > 0.05) & (errors < 1))
+    assert solution.camera.headers.odd == ("3",)
+    check = next(check for check in solution.checks if check.name == "camera")
+    assert check.state == "warn"
+    assert check.sentence.startswith("the headers have detector 3 3")
+    assert "after one affine map of all together" in " ".join(str(solution).split())
+
+
+@pytest.mark.slow
+def test_errors_of_a_layout_beside_statics_with_widths_are_right():
+    found = []
+    for seed in range(12):
+        night = header_layouts.Night(seed, off=2.0, turn=0.05, n=7, n_stars=250, odd=(22.0, -24.0, 0.6))
+        solution = legdistort.solve(with_drawn_statics(night, seed))
+        found.append((night.layout_pull(solution.camera), *night.pulls(solution)))
+    assert np.mean(found, axis=0) == pytest.approx(1, abs=4 * np.sqrt(2 / 24))
 
 
 def with_false_ties(matches, n):
