@@ -36,8 +36,9 @@ _SHIFT_WEIGHT, _LAYOUT_WEIGHT = 0.003, 0.03
 _STATED_SHIFT, _STATED_LAYOUT = 0.1, 10.0
 #: Part of a direction that may be left of it where it counts as one of several.
 _LIES_IN = 0.3
-#: Part of the largest unknown of a direction that is rounding: the direction has nothing of an unknown with less.
-_ROUNDED = 1e-6
+#: Unknowns of less than this part of the largest of the directions are not judged in units of their own: what
+#: directions have of them is of second order, or rounding.
+_ROUNDED = 1e-3
 #: Layouts that agree so well [pix] are the same.
 _SAME = 1e-6
 #: Steps at most, and their length in standard errors at which they end.

@@ -4,6 +4,7 @@ import re
 import warnings
 from dataclasses import replace
 
+import four_detectors
 import header_layouts
 import numpy as np
 import pytest
@@ -205,6 +206,20 @@ def test_a_layout_beside_statics_with_widths_is_determined():
     assert check.state == "warn"
     assert check.sentence.startswith("the headers have detector 3 3")
     assert "after one affine map of all together" in " ".join(str(solution).split())
+
+
+def test_a_layout_beside_departures_by_evidence_is_determined():
+    """Second order was taken for a direction that nothing determines: no star had an absolute error by a catalogue."""
+    stars = np.random.default_rng(0).uniform(-400, 2 * (four_detectors.SIZE + four_detectors.GAP) + 340, (160, 2))
+    matches, known = four_detectors.matches(None, 0), stars[:60] + np.random.default_rng(1).normal(0, 0.02, (60, 2))
+    catalogue = Table({"star": np.arange(60), "x": known[:, 0], "y": known[:, 1]})
+    catalogue["x_err"] = catalogue["y_err"] = 0.02
+    options = {"layout": "fit", "static": "fit", "prior": legdistort.Prior(None, sigma="evidence")}
+    solution = legdistort.solve(matches, degree=3, reference=catalogue, **options)
+    table = solution.stars
+    off = np.stack([table["x"].value, table["y"].value], axis=1) - stars[np.asarray(table["star"])]
+    error = np.stack([table["x_err_abs"].value, table["y_err_abs"].value], axis=1)
+    assert 0.3 < np.sum(off**2) / np.sum(error**2) < 2
 
 
 @pytest.mark.slow
