@@ -46,7 +46,7 @@ class Night:
     odd : tuple of str
         Of several nights that were solved together those that depart farther than the others, and were left out.
     exposures : tuple of str
-        Fingerprints of what was measured, so that nothing counts twice.
+        Fingerprints of what was measured in those that count, so that nothing counts twice.
     """
 
     name: str
@@ -74,7 +74,9 @@ class Night:
         counts["n_nights"] = 1 if shown.nightly is None else int(np.count_nonzero(~nights["odd"]))
         date = float(np.mean(column_contract.values(table, "epoch", u.yr))) if "epoch" in table.colnames else None
         odd = tuple(str(each) for each in nights["name"][nights["odd"]])
-        return cls(name, date=date, odd=odd, exposures=sum(fingerprints(solution).values(), ()), **counts, **given)
+        measured, used = fingerprints(solution), set(table["exposure"])
+        marks = tuple(mark for each in solution.names if each in used for mark in measured[each])
+        return cls(name, date=date, odd=odd, exposures=marks, **counts, **given)
 
 
 def night_of(item):

@@ -78,6 +78,8 @@ class StarDifference:
         Of the common map.
     epoch : float or None
         Julian year of the places.
+    pixel_scale : float or None
+        Arcsec, as stated of the first.
     """
 
     table: QTable
@@ -86,6 +88,7 @@ class StarDifference:
     n_stars: tuple[int, int]
     degree: int
     epoch: float | None
+    pixel_scale: float | None = None
 
     def lines(self) -> list[str]:
         """What `print` shows of them."""
@@ -94,12 +97,35 @@ class StarDifference:
         out = [f"{both}: places{at} differ by {self.places.in_words('px', self.degree)}."]
         if self.motions is not None:
             out.append(f"Motions differ by {self.motions.in_words('px/yr', self.degree)}.")
+        if self.angles is not None:
+            figures = [f"{self.angles[f'places_{kind}']:.2g}" for kind in ("similarity_mas", "mas")]
+            out.append(f"At {self.pixel_scale:.6g} arcsec a pixel: places {' and '.join(figures)} mas")
+            if self.motions is not None:
+                figures = [f"{self.angles[f'motions_{kind}']:.2g}" for kind in ("similarity_mas_yr", "mas_yr")]
+                out[-1] += f", motions {' and '.join(figures)} mas/yr"
+            out[-1] += "."
         if np.isnan(self.places.p):
             out.append("Exposures are in both: errors are the larger of the two, and chances are not known.")
         worst = self.table[:NAMED].copy()
         for name in worst.colnames[1:]:
             worst[name].info.format = ".2f" if name in ("x", "y", "ratio", "v_ratio") else ".4f"
         return [*out, "The largest differences over their errors:", *worst.pformat(max_lines=-1, max_width=-1)]
+
+    @property
+    def angles(self) -> dict[str, float] | None:
+        """Differences in mas where a pixel scale is stated, rms per axis, else None.
+
+        ``places_similarity_mas`` after a common shift, rotation and scale, ``places_mas`` after a common map; with
+        motions ``motions_similarity_mas_yr``, ``motions_mas_yr``.
+        """
+        if self.pixel_scale is None:
+            return None
+        found = {}
+        for name, unit, each in (("places", "mas", self.places), ("motions", "mas_yr", self.motions)):
+            if each is not None:
+                found[f"{name}_similarity_{unit}"] = 1000 * self.pixel_scale * each.rms_similarity
+                found[f"{name}_{unit}"] = 1000 * self.pixel_scale * each.rms
+        return found
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as numbers and texts for JSON; of the stars those that are named."""
@@ -109,7 +135,12 @@ class StarDifference:
             for kind, each in kinds.items()
         }
         counts = {"n_stars": len(self.table), "n_first": self.n_stars[0], "n_second": self.n_stars[1]}
-        more = {"degree": self.degree, "epoch_yr": self.epoch, "largest": records(self.table[:NAMED])}
+        more = {
+            "degree": self.degree,
+            "epoch_yr": self.epoch,
+            "angles": self.angles,
+            "largest": records(self.table[:NAMED]),
+        }
         return counts | figures | more
 
 
@@ -176,7 +207,8 @@ def compare_stars(first, second, *, shared):
         table[f"{prefix}_error".lstrip("_")] = errors[0] * unit
         table[f"{prefix}_ratio".lstrip("_")] = np.sqrt(np.mean(left**2, axis=1)) / errors[0]
     table = table[np.argsort(-table["ratio"])]
-    return StarDifference(table, found[0], found[1] if moving else None, counts, degree, year)
+    scale = in_tables.pixel_scale(first)
+    return StarDifference(table, found[0], found[1] if moving else None, counts, degree, year, scale)
 
 
 def _at_one_time(first, second):

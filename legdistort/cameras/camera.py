@@ -380,10 +380,13 @@ class Camera(ShownAsPrinted):
                 "a camera of another instrument? Else leave these extensions out, or add the detector to the camera"
             )
         if exposure.shape != self[key].shape:
+            (ny, nx), binned = exposure.shape, ""
+            if self.name == "GSAOI" and ny == nx:
+                binned = f", or if pixels are binned give Camera.gsaoi(size={nx}), its file (Camera.write) as --camera"
             raise InputError(
                 f"{exposure.name} has shape {exposure.shape}, detector {key} of camera {self.name} {self[key].shape} "
                 "(ny, nx): is it a camera of another instrument? Else leave the camera "
-                "out, which takes the layout of the headers"
+                f"out, which takes the layout of the headers{binned}"
             )
 
     @classmethod

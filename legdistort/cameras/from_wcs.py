@@ -7,8 +7,9 @@ where the telescope pointed is left but the side of the sky that is up.
 
 import numpy as np
 
-from ..exceptions import InputError
+from ..exceptions import InputError, some_of
 from ..geometry import basis, similarity, tangent_plane
+from ..inputs.exposure_files import listed
 from ..inputs.file_images import KEYWORDS, detector_ids
 from ..inputs.sky_wcs import to_icrs
 from ..runtime.words import DIRECTIONS
@@ -22,7 +23,7 @@ SAME, HIGHEST = 1e-4, 9
 
 def camera_of(kind, exposures, name=None):
     """Camera, the `kind`, from the WCSs of one exposure (see `legdistort.cameras.camera.Camera.from_exposures`)."""
-    named = exposures if isinstance(exposures, dict) else _by_detector(list(exposures))
+    named = exposures if isinstance(exposures, dict) else _by_detector(listed(exposures, "Camera.from_exposures"))
     if not named:
         raise InputError("a camera needs the exposure of one detector at least, got none")
     for key, exposure in named.items():
@@ -54,9 +55,15 @@ def _by_detector(exposures):
     if None in ids or len(set(ids)) < len(ids):
         ids = detector_ids([each.header for each in exposures])
     if ids is None:
+        groups = list(dict.fromkeys(each.exposure for each in exposures))
+        if 1 < len(groups) < len(exposures):
+            raise InputError(
+                f"these are {len(groups)} exposures ({some_of(groups, 4)}), and a layout is that of one: give the "
+                "detectors of one of them, or all to Camera.of_frames, which takes the one that has most detectors"
+            )
         raise InputError(
-            f"the headers of {', '.join(each.name for each in exposures)} do not distinguish their detectors by any of "
-            f"{', '.join(KEYWORDS)}: give a dict {{id: exposure}} of the detectors of one exposure"
+            f"the headers of {some_of([each.name for each in exposures], 6)} do not distinguish their detectors by any "
+            f"of {', '.join(KEYWORDS)}: give a dict {{id: exposure}} of the detectors of one exposure"
         )
     return dict(zip(ids, exposures, strict=True))
 

@@ -10,7 +10,7 @@ import sys
 import time
 from importlib.metadata import version
 
-from .arguments import add_options
+from .arguments import add_options, flagged
 from .process import with_streams
 from .usage import COMMANDS
 
@@ -35,7 +35,9 @@ def main(argv=None):
 def _parsed(argv):
     arguments, unknown = _parser().parse_known_args(argv)
     if unknown:
-        arguments.parser.error(f"no option or place for {' '.join(unknown)}")
+        flags = [word.partition("=")[0] for word in unknown]
+        others = "".join(f"; {flag} is an option of {', '.join(of)}" for flag in flags if (of := _having(flag)))
+        arguments.parser.error(f"no option or place for {' '.join(unknown)}{others}")
     return arguments
 
 
@@ -50,10 +52,15 @@ class _Parser(argparse.ArgumentParser):
         if wrong := re.search(r"invalid choice: '?([^' ]*)'? \(choose from (.*)\)", message):
             known = re.findall(r"[^', ]+", wrong[2])
         words = [wrong[1]] if wrong else re.findall(r"(?<!\S)-[\w-]+", message)
-        near = [match for word in words if word not in known for match in _nearest(word, known)]
+        near = [match for word in words if word not in known and not _having(word) for match in _nearest(word, known)]
         message = re.sub(r"'([^' ]*)'", r"\1", message)
         hint = f"; did you mean {' '.join(near)}?" if near else ""
         self.exit(2, f"{self.prog}: {message}{hint} ({self.prog} --help lists what there is)\n")
+
+
+def _having(word):
+    """Names of the commands that have an option."""
+    return [name for name, command in COMMANDS.items() if word in (flag for _, flag, _, _ in flagged(command.groups))]
 
 
 def _nearest(word, known):

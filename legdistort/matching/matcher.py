@@ -405,7 +405,7 @@ def _associate(lists, names, headers, left_out, options):
         lists = [stars.subset(~h) for stars, h in zip(lists, hot, strict=True)]
         few = max(h.mean() for h in hot) < FEW_HOT  # they have not led the registrations astray
         groups = [without(group, hot) for group in groups] if few else grouped(lists)
-    _check_groups(groups, lists, names, left_out)
+    _check_groups(groups, lists, names, left_out, tolerance)
     warn_of_lattice(lists, names, groups[0].poses, headers)
     registrations, misfits = interlink(lists, groups[0], tolerance=tolerance, progress=progress)
     left_out.update({names[i]: reason for i, reason in misfits.items()})
@@ -417,7 +417,7 @@ def _associate(lists, names, headers, left_out, options):
     return dict(zip(names, labels, strict=True))
 
 
-def _check_groups(groups, lists, names, left_out):
+def _check_groups(groups, lists, names, left_out, tolerance):
     for group in groups:
         if len(group.poses) == 1:
             (only,) = group.poses
@@ -426,9 +426,10 @@ def _check_groups(groups, lists, names, left_out):
     if len(large) > 1:
         raise apart(large, "match each group by itself; fields of one camera can be solved together then")
     if not large:
+        given = f"tolerance={tolerance:g} (--tolerance) is no reach of the search, but how far one star may lie apart"
         raise MatchError(
             f"no two exposures show the same stars (tried {some_of(names, 6)}); check that they overlap and that the "
-            "detections are stars"
+            "detections are stars" + (f"; {given}: leave it out, it is found" if tolerance is not None else "")
         )
 
 

@@ -6,6 +6,8 @@ from ..geometry import basis
 from . import elements
 
 _ARROWS = 13  # along the longer side of a detector
+#: Magnification at most: arrows of what is far below a thousandth of a pixel are short, and do not look like something.
+_MOST = 1e4
 
 
 def plot_difference(difference, *, ax=None, scale=None):
@@ -17,7 +19,7 @@ def plot_difference(difference, *, ax=None, scale=None):
     ax : `~matplotlib.axes.Axes`, optional
         Where to draw.
     scale : float, optional
-        Magnification; by default a round number that makes the longest arrow 6 % of a detector.
+        Magnification; by default a round number that makes the longest arrow 6 % of a detector, 10 000 at most.
     """
     shapes, count = difference.shapes, len(difference.shapes)
     columns = int(np.ceil(np.sqrt(count)))
@@ -28,7 +30,7 @@ def plot_difference(difference, *, ax=None, scale=None):
     fields = {key: np.tensordot(each, basis.values(basis.degree_of(each.shape[1]), u, v), 1)
               for key, each in difference.coefficients.items()}  # fmt: skip
     longest = max(np.hypot(*each).max() for each in fields.values())
-    scale = scale or elements.round_down(0.06 * size / (longest or 1))
+    scale = scale or min(elements.round_down(0.06 * size / (longest or 1)), _MOST)
     for number, (key, (ny, nx)) in enumerate(shapes.items()):
         corner = 1.08 * size * np.array([number % columns, -(number // columns)])
         edge = np.array([[0, 0], [nx, 0], [nx, ny], [0, ny]]) - 0.5 + corner

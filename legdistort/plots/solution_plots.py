@@ -179,8 +179,9 @@ def plot_coefficients(solution, name=None, *, lowest=0, fig=None):
     solution : `~legdistort.results.solution.Solution`
         What is drawn.
     name : str, optional
-        One exposure, with its 1-sigma errors, relative ones; by default the mean of all with the scatter of the
-        exposures (standard deviation), and beside it the error of one, the median of a dozen.
+        One exposure, with its 1-sigma errors, relative ones; by default the mean of all but those of nights that are
+        odd, with the scatter of the exposures (standard deviation), and beside it the error of one, the median of a
+        dozen.
     lowest : int
         Lowest degree that is drawn: 2 leaves out what is like shift, rotation, scale and shear.
     fig : `~matplotlib.figure.Figure`, optional
@@ -243,10 +244,13 @@ def _coefficients(solution, name):
     if name is not None:
         values, prior = _parts(solution, name, "total")
         return values, prior, elements.shorten(name), {"1σ": ("black", _padded(solution, [name]))}
-    values, prior = np.mean(solution.coefficients, axis=0), np.mean(solution.estimate.prior_mean, axis=0)
-    bars = {"scatter": ("black", np.std(solution.coefficients, axis=0))}
-    some = solution.names[:: -(-len(solution.names) // PANELS)]
-    return values, prior, "mean", bars | {"1σ error": (elements.RED, _padded(solution, some))}
+    odd = {each for names in solution.nights["exposures"][solution.nights["odd"]] for each in names.split(", ")}
+    like = [i for i, each in enumerate(solution.names) if each not in odd]
+    values, prior = (np.mean(each[like], axis=0) for each in (solution.coefficients, solution.estimate.prior_mean))
+    bars = {"scatter": ("black", np.std(solution.coefficients[like], axis=0))}
+    some = [solution.names[i] for i in like[:: -(-len(like) // PANELS)]]
+    bars["1σ error"] = elements.RED, _padded(solution, some)
+    return values, prior, "mean" + " but for odd nights" * bool(odd), bars
 
 
 def _padded(solution, names):

@@ -115,10 +115,10 @@ class Gallery:
         panels = solution_plots.plot_coefficients(solution, lowest=2, fig=_quick_figure())
         return self.add(
             panels[0].figure,
-            "Coefficients of the Legendre modes of degree 2 and up, mean of the exposures, beside the prior if there "
-            "is one. Scatter: from one exposure to the next; 1σ error: of one exposure. Where a few "
-            "exceed all others by far, the axis is logarithmic beyond its linear middle. Large values in the highest "
-            "orders that were fitted would mean a degree too low or too few stars.",
+            "Coefficients of the Legendre modes of degree 2 and up, mean of the exposures but for those of nights "
+            "that are odd, beside the prior if there is one. Scatter: from one exposure to the next; 1σ error: of one "
+            "exposure. Where a few exceed all others by far, the axis is logarithmic beyond its linear middle. Large "
+            "values in the highest orders that were fitted would mean a degree too low or too few stars.",
             bottom=0.8,
             left=0.85,
             hspace=0.08,

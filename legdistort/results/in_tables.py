@@ -153,6 +153,7 @@ def _meta(solution):
         "epoch": epoch(solution),
         "gauge": solution.gauge.kind,
         "degree": solution.degree,
+        "pixel_scale": pixel_scale(solution),
         "prior": None if solution.settings.prior is None else str(prior or "given"),
         "version": f"legdistort {solution.provenance.get('versions', {}).get('legdistort', '')}".strip(),
     }
@@ -165,16 +166,21 @@ def rms(solution):
     return np.array([np.sqrt(np.mean(solution.residuals[d][used].to_value(u.pix) ** 2)) for d in ("dx", "dy")])
 
 
+def pixel_scale(solution):
+    """Arcsec a pixel where that was stated, by the sky if there is one; else None."""
+    stated = solution.settings.pixel_scale
+    return None if stated is None else float(stated if solution.sky is None else solution.sky.pixel_scale)
+
+
 def in_mas(solution):
     """Figures in mas where a pixel scale was stated, by that of the sky if there is one; else None.
 
     ``pixel_scale_arcsec``; ``rms_mas``, residuals per axis; medians over the stars of ``error_mas``, ``error_abs_mas``,
     ``motion_error_mas_yr``, ``motion_error_abs_mas_yr``: None where nothing is known.
     """
-    scale = solution.settings.pixel_scale
+    scale = pixel_scale(solution)
     if scale is None:
         return None
-    scale = float(scale if solution.sky is None else solution.sky.pixel_scale)
     stars, found = (
         solution.stars,
         {"pixel_scale_arcsec": scale, "rms_mas": 1000 * scale * float(np.sqrt(np.mean(rms(solution) ** 2)))},
@@ -323,10 +329,13 @@ _RMS = "dx", "dy"
 
 def layout_errors(solution):
     """What the errors of a layout that was fitted leave out, in words; empty where none was."""
-    errors = solution.estimate.uncertainty.camera
-    if errors is None or not solution.camera.has_focal_plane or not (free := errors.free.any(axis=(0, 1)))[:3].any():
+    errors, common = solution.estimate.uncertainty.camera, solution.camera.common_sigma
+    if errors is None or not solution.camera.has_focal_plane or not errors.free[:, :, :3].any():
         return ""
-    degree = basis.degree_of(np.count_nonzero(free)) if free[:3].all() else 1
+    degree = 1
+    if common is not None:  # infinite where exposures take over what detectors have in common
+        orders = np.add(*basis.orders(basis.degree_of(common.shape[1])))
+        degree = orders[np.isinf(common).any(axis=0)].max(initial=1)
     which = "one affine map" if degree < 2 else f"one map of degree {degree}"
     unknown = f", and {solution.gauge.unknown_in_words}" if solution.gauge.unknown_names else ""
     return (

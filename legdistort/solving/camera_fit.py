@@ -36,6 +36,9 @@ _SHIFT_WEIGHT, _LAYOUT_WEIGHT = 0.003, 0.03
 _STATED_SHIFT, _STATED_LAYOUT = 0.1, 10.0
 #: Part of a direction that may be left of it where it counts as one of several.
 _LIES_IN = 0.3
+#: Unknowns of less than this part of the largest of the directions are not judged in units of their own: what
+#: directions have of them is of second order, or rounding.
+_ROUNDED = 1e-3
 #: Layouts that agree so well [pix] are the same.
 _SAME = 1e-6
 #: Steps at most, and their length in standard errors at which they end.
@@ -314,7 +317,8 @@ def _groups(fit):
 def _unknown(camera, step):
     """Directions (m, k), of unit rms over the unknowns, that are not determined and no exposure can take over."""
     exchanged = _exchanged(camera, step.free)
-    scale = np.abs(step.weak).max(axis=0, initial=0) + np.finfo(float).tiny
+    scale = np.abs(step.weak).max(axis=0, initial=0)
+    scale = np.maximum(scale, max(_ROUNDED * scale.max(initial=0), np.finfo(float).tiny))
     weak, common = (
         step.weak / scale,
         np.linalg.qr((exchanged / scale).T)[0] if len(exchanged) else np.zeros((len(scale), 0)),
@@ -367,7 +371,8 @@ def _tell_unknown(matches, step, unknown):
         f"{len(unknown)} unknowns of camera {camera.name} are not determined by these exposures and stay where they "
         f"were, above all of detector {', '.join(named)}{apart}: stars that one detector sees in one exposure and "
         "another in the next determine how these lie; dither over the gaps, or say how well the layout is known "
-        "(layout_sigma)",
+        "(layout_sigma); if these dithers are larger than the gaps, the layout is too far off to find such stars "
+        "(camera=, --camera)",
         AssumptionWarning,
     )
 

@@ -326,8 +326,8 @@ def _of_camera(matches, prior, model, degree, layout, static, exposure_degree):
     if exposure_degree is not None:
         raise InputError(
             "exposure_degree is for single detectors; with a camera every exposure has a distortion of the focal plane "
-            "of the whole degree: leave exposure_degree out, or take every detector by itself (static='fit' and "
-            "dynamic='detector')"
+            "of the whole degree, which prior=Prior(None, sigma='evidence') (--prior-sigma evidence) keeps as small as "
+            "it is: leave exposure_degree out, or take every detector by itself (static='fit' and dynamic='detector')"
         )
     check_places(matches)
     sought = Sought.of(matches, layout, static, 3 if isinstance(degree, str) else degree)

@@ -250,6 +250,9 @@ def test_an_odd_night_among_others_that_were_solved_with_it_is_left_out():
     error = np.sqrt(np.diag(expected.static()[1])).reshape(2, -1)[:, 3:]
     assert np.all(away < 0.3 * error)
     assert_allclose(combined.scatter, expected.scatter, rtol=0.5, atol=1e-3)
+    left_out = ld.solve(ld.Matches.from_table(table[table["block"] == nights.odd], shape=SHAPE))
+    assert ld.difference(combined, left_out).shared == ()  # it is not in the map, and may be told from it, or added
+    assert len(ld.combine_nights([combined, left_out]).nights) == 2
 
 
 def test_of_two_that_contradict_one_another_neither_is_odd(three):

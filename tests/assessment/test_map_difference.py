@@ -6,6 +6,7 @@ import four_detectors
 import numpy as np
 import pytest
 from astropy.modeling.models import Identity, Legendre2D, Mapping
+from matplotlib import pyplot
 from night_sets import SIZE, Nights, field
 from numpy.testing import assert_allclose
 from rolled_night import modes, night
@@ -44,6 +45,16 @@ def test_a_map_does_not_differ_from_itself():
     assert nothing.agrees is None
     assert "neither states an error" in nothing.sentence
     assert np.isnan(nothing.modes["error"]).all()
+
+
+def test_arrows_of_nothing_do_not_look_like_something():
+    """Digits that a file rounds were drawn as arrows of a twentieth of the detector."""
+    prior = old(1)
+    ax = ld.difference(prior, ld.Prior(prior.mean * (1 + 1e-9), shape=SHAPE)).plot()
+    assert "arrows x 10000" in ax.get_title(loc="left")
+    (arrows,) = ax.collections
+    assert np.hypot(arrows.U, arrows.V).max() < 1e-3 * SIZE
+    pyplot.close(ax.figure)
 
 
 def test_a_night_does_not_differ_from_itself():

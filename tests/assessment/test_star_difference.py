@@ -76,6 +76,23 @@ def test_with_and_without_a_night_nothing_is_significant(tmp_path, capsys):
     assert len(figures["stars"]["largest"]) == 5
 
 
+def test_differences_in_mas_where_the_pixel_scale_is_stated():
+    one, two = halves(Nights(5, nights=4, per=3, n_stars=100, motion=0.05), motion="proper", pixel_scale=0.02)
+    found = ld.difference(one, two).stars
+    assert "At 0.02 arcsec a pixel: places " in "\n".join(found.lines())
+    assert found.to_dict()["angles"] == pytest.approx(
+        {
+            "places_similarity_mas": 20 * found.places.rms_similarity,
+            "places_mas": 20 * found.places.rms,
+            "motions_similarity_mas_yr": 20 * found.motions.rms_similarity,
+            "motions_mas_yr": 20 * found.motions.rms,
+        }
+    )
+    assert one.stars.meta["pixel_scale"] == 0.02
+    assert one.stars["x"].unit == "pix"
+    assert ld.difference(*halves(Nights(2, n_stars=100))).stars.to_dict()["angles"] is None
+
+
 def test_a_star_that_is_somewhere_else_is_named():
     right, wrong = (ld.difference(*halves(Nights(2, n_stars=120), moved)) for moved in (None, 17))
     assert right.shared == wrong.shared == ()

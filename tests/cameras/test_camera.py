@@ -226,6 +226,22 @@ class TestFromExposures:
         with pytest.raises(InputError, match="f, g do not distinguish their detectors by any of CCDCHIP"):
             legdistort.Camera.from_exposures(exposures)
 
+    def test_of_several_exposures_it_is_said_who_takes_them(self):
+        headers = {k: self.header(k) for k in (1, 2)}
+        exposures = [
+            Exposure(f"{e}_{k}", np.zeros((300, 200)), wcs=WCS(header), header=header, exposure=e, detector=str(k))
+            for e in ("f", "g") for k, header in headers.items()
+        ]  # fmt: skip
+        with pytest.raises(InputError, match=r"these are 2 exposures \(f, g\), and a layout is .* Camera\.of_frames"):
+            legdistort.Camera.from_exposures(exposures)
+        assert list(legdistort.Camera.of_frames(exposures).detectors) == ["1", "2"]
+
+    def test_of_gsaoi_with_binned_pixels_the_size_is_named(self):
+        binned = Exposure("f_1", np.zeros((512, 512)), exposure="f", detector="1")
+        with pytest.raises(InputError, match=r"if pixels are binned give Camera\.gsaoi\(size=512\)"):
+            legdistort.Camera.gsaoi().check(binned)
+        legdistort.Camera.gsaoi(size=512).check(binned)
+
     def test_without_wcs(self):
         with pytest.raises(InputError, match=r"f \(detector 1\) has no celestial WCS"):
             legdistort.Camera.from_exposures({1: Exposure("f", np.zeros((300, 200)))})

@@ -208,6 +208,10 @@ def test_noise_frame_is_left_out_by_name(whole):
         (["slove", "m.ecsv"], r"legdistort: .*invalid choice: slove .*; did you mean solve\?"),
         (["solve", "m.ecsv", "--degre", "3", "--out", "x"], r"legdistort solve: .* --degre 3; did you mean --degree\?"),
         (["run", "a.fits", "--over", "--out", "x"], r"legdistort run: .* --over; did you mean --overwrite\?"),
+        (
+            ["match", "a.lis", "--pixel-scale=0.02", "--out", "m.ecsv"],
+            r"legdistort match: .* --pixel-scale=0.02; --pixel-scale is an option of run, solve, predict \(",
+        ),
         (["solve"], r"legdistort solve: the following arguments are required: TABLE, --out \("),
     ],
 )

@@ -505,3 +505,16 @@ def test_repeated_rows_count_once(caplog):
     again = match(vstack([table, table[:5]]), shape=(2048, 2048))
     assert len(again.table) == len(whole.table)
     assert "5 detections stand twice" in caplog.text
+
+
+def test_a_tolerance_that_hides_all_is_named():
+    """It was given as a reach of the search."""
+    rng = np.random.default_rng(3)
+    stars, rows = rng.uniform(0, 500, (200, 2)), []
+    for name in ("a", "b", "c", "d"):
+        xy = stars + rng.uniform(-30, 30, 2)
+        rows += [(name, *each, 0.02, 0.02) for each in xy[np.all((xy > 0) & (xy < 499), axis=1)]]
+    table = Table(rows=rows, names=["exposure", "x", "y", "x_err", "y_err"])
+    with pytest.raises(MatchError, match=r"; tolerance=60 \(--tolerance\) is no reach of the search, .* leave it out"):
+        match(table, shape=(500, 500), tolerance=60)
+    assert len(match(table, shape=(500, 500)).names) == 4

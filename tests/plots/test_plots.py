@@ -11,11 +11,13 @@ from matplotlib.collections import EllipseCollection, LineCollection, PathCollec
 from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver, QuiverKey
+from night_sets import SIZE, Nights
 from scipy import stats
 
 from legdistort.assessment.pulls import pulls_of
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis
+from legdistort.matching.matches import Matches
 from legdistort.plots import elements, residual_plots, solution_plots, stack_plots
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
@@ -174,6 +176,15 @@ def test_bars_of_all_exposures_show_mean_and_scatter(solution):
     for name, size in {"scatter": solution.coefficients[:, 0].std(axis=0), "1σ error": 0.01}.items():
         error = bars[name].lines[2][0].get_segments()
         np.testing.assert_allclose([np.ptp(s[:, 1]) / 2 for s in error], size)
+
+
+def test_odd_nights_are_not_in_the_mean():
+    nights = Nights(5, nights=6, per=2, odd=0.5, roll=0.7, n_stars=100)
+    solution = solve(Matches.from_table(nights.table, shape=(SIZE, SIZE)))
+    like = [not name.startswith(f"n{nights.odd}") for name in solution.names]
+    bars = {c.get_label(): c for c in solution_plots.plot_coefficients(solution)[0].containers}
+    expected = solution.coefficients[like, 0].mean(axis=0)
+    np.testing.assert_allclose([b.get_height() for b in bars["mean but for odd nights"]], expected)
 
 
 def test_lowest_degree_leaves_out_what_is_like_a_pose(solution):

@@ -261,7 +261,8 @@ def test_size_of_a_pickle():
     assert len(solution.residuals) > 23000
     size = 2 * basis.n_modes(3)
     covariances = replace(plain_covariances(solution.estimate), coefficients=np.zeros((60 * size, 60 * size)))
-    large = replace(solution, estimate=replace(solution.estimate, uncertainty=covariances))  # as degree 3 has them
+    known = {"uncertainty": covariances, "checked": solution.checks}  # as degree 3 has them
+    large = replace(solution, estimate=replace(solution.estimate, **known))
     assert len(pickle.dumps(large)) <= 16e6
     before = len(pickle.dumps(solution))
     _ = solution.stars, solution.checks, solution["exp00"].wcs, solution["exp01"].residuals

@@ -4,6 +4,7 @@ import re
 import warnings
 from dataclasses import replace
 
+import four_detectors
 import header_layouts
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from astropy.table import Table
 import legdistort
 from legdistort.cameras import ties
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortWarning
+from legdistort.solving.camera_fit import in_camera
 
 STATES = ("camera", "absolute")
 
@@ -125,6 +127,13 @@ def test_the_check_of_absolute_positions_names_what_cures_it(near, name):
     assert after.state == "pass"
 
 
+def test_no_width_is_offered_of_a_layout_that_is_to_be_found_without(near):
+    """--layout fit with --layout-sigma is refused: the check led there."""
+    check = next(check for check in legdistort.solve(near[1], layout="fit").checks if check.name == "absolute")
+    assert "--pose-sigma" in check.cure
+    assert "--layout-sigma" not in check.cure
+
+
 def test_held(near):
     """As exact: the stars do not agree with it, and that is said."""
     solution = legdistort.solve(near[1], layout="hold")
@@ -159,6 +168,68 @@ def test_what_no_star_ties_is_not_determined(apart, groups):
             assert "1 | 2 | 3 | 4" in check.sentence
             assert "dithers larger than the gaps" in check.cure
     assert groups.camera["2"].place.errors == (np.inf,) * 3
+
+
+def test_a_layout_that_hides_the_stars_that_cross_is_named():
+    """Farther off than these are looked for: that was blamed on the dithers, which are three times the gaps."""
+    night = header_layouts.Night(2, off=2.0, turn=0.05, odd=(70.0, 0.0, 0.0))
+    with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        solution = legdistort.solve(legdistort.match(night.table, exposures=night.exposures))
+    assert ties.apart(solution.camera, solution.residuals).endswith("1, 2, 4 | 3")
+    check = next(check for check in solution.checks if check.name == "camera")
+    assert check.state == "warn"
+    assert re.search(
+        r"1, 2, 4 \| 3\), but by the layout \d+ stars are seen by several of them: it may be wrong", check.sentence
+    )
+    assert check.cure.startswith("a layout that is nearer, by better headers or a camera file (--camera)")
+    absolute = next(check for check in solution.checks if check.name == "absolute")
+    assert "if these dithers are larger than the gaps: stars are looked for to 60 px and 1 degree" in absolute.cure
+
+
+def with_drawn_statics(night, seed, sigma=0.3):
+    """Matches of a camera that states static distortions which are off by their widths; there are none."""
+    matches, rng = legdistort.match(night.table, exposures=night.exposures), np.random.default_rng(seed)
+    statics = np.concatenate([np.zeros((4, 2, 3)), rng.normal(0, sigma, (4, 2, 7))], axis=2)
+    detectors = {key: replace(each, static=static, static_sigma=sigma)
+                 for (key, each), static in zip(matches.camera.detectors.items(), statics, strict=True)}  # fmt: skip
+    return in_camera(matches, replace(matches.camera, detectors=detectors))
+
+
+def test_a_layout_beside_statics_with_widths_is_determined():
+    """Rounding was taken for a direction that is not: errors were infinite, and a wrong header went into the sky."""
+    night = header_layouts.Night(2, off=2.0, turn=0.05, n=7, n_stars=250, odd=(22.0, -24.0, 0.6))
+    solution = legdistort.solve(with_drawn_statics(night, 2), layout="fit", static="prior")
+    errors = np.array([solution.camera[key].place.errors[:2] for key in header_layouts.KEYS])
+    assert np.all((errors > 0.05) & (errors < 1))
+    assert solution.camera.headers.odd == ("3",)
+    check = next(check for check in solution.checks if check.name == "camera")
+    assert check.state == "warn"
+    assert check.sentence.startswith("the headers have detector 3 3")
+    assert "after one affine map of all together" in " ".join(str(solution).split())
+
+
+def test_a_layout_beside_departures_by_evidence_is_determined():
+    """Second order was taken for a direction that nothing determines: no star had an absolute error by a catalogue."""
+    stars = np.random.default_rng(0).uniform(-400, 2 * (four_detectors.SIZE + four_detectors.GAP) + 340, (160, 2))
+    matches, known = four_detectors.matches(None, 0), stars[:60] + np.random.default_rng(1).normal(0, 0.02, (60, 2))
+    catalogue = Table({"star": np.arange(60), "x": known[:, 0], "y": known[:, 1]})
+    catalogue["x_err"] = catalogue["y_err"] = 0.02
+    options = {"layout": "fit", "static": "fit", "prior": legdistort.Prior(None, sigma="evidence")}
+    solution = legdistort.solve(matches, degree=3, reference=catalogue, **options)
+    table = solution.stars
+    off = np.stack([table["x"].value, table["y"].value], axis=1) - stars[np.asarray(table["star"])]
+    error = np.stack([table["x_err_abs"].value, table["y_err_abs"].value], axis=1)
+    assert 0.3 < np.sum(off**2) / np.sum(error**2) < 2
+
+
+@pytest.mark.slow
+def test_errors_of_a_layout_beside_statics_with_widths_are_right():
+    found = []
+    for seed in range(12):
+        night = header_layouts.Night(seed, off=2.0, turn=0.05, n=7, n_stars=250, odd=(22.0, -24.0, 0.6))
+        solution = legdistort.solve(with_drawn_statics(night, seed))
+        found.append((night.layout_pull(solution.camera), *night.pulls(solution)))
+    assert np.mean(found, axis=0) == pytest.approx(1, abs=4 * np.sqrt(2 / 24))
 
 
 def with_false_ties(matches, n):

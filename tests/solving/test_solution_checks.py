@@ -365,12 +365,13 @@ def test_a_degree_too_high_is_said():
     matches = simulated(4, n_exposures=8, n_stars=80, degree=1).matches
     check = next(c for c in solved(matches, degree=3).checks if c.name == "degree")
     assert check.state == "warn"
-    assert "--degree 2 fits as well" in check.cure
+    assert check.cure.startswith("--degree 2, or --prior-sigma evidence")
 
 
 def test_exposures_that_are_not_distorted_are_said_to_be_so():
     matches = simulated(4, n_exposures=8, n_stars=80, static=0.0, dynamic=0.0).matches
     assert states(solved(matches))["dynamic part"] == "warn"
+    assert states(solved(matches, prior=ld.Prior(None, sigma="evidence")))["dynamic part"] == "pass"
 
 
 def test_errors_that_were_found_are_said_to_be_and_judged_as_they_are():

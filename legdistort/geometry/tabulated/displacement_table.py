@@ -16,6 +16,7 @@ from .linear import interpolated, slopes
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from astropy.modeling import Model
     from numpy.typing import ArrayLike
 
 #: Cells along an axis, at most.
@@ -101,7 +102,7 @@ class DisplacementTable:
         return cls(values, (low, low), (float(apart[0]), float(apart[1])))
 
     @classmethod
-    def from_models(cls, along_x: models.Tabular2D, along_y: models.Tabular2D) -> DisplacementTable:
+    def from_models(cls, along_x: Model, along_y: Model) -> DisplacementTable:
         """The table of two models, displacements along x and along y.
 
         Raises
@@ -164,7 +165,7 @@ class DisplacementTable:
 
     __hash__ = None  # type: ignore[assignment]
 
-    def models(self) -> tuple[FastTabular2D, FastTabular2D]:
+    def models(self) -> tuple[Model, Model]:
         """Displacements along x and along y as astropy models of (x, y)."""
         points = tuple(
             first + step * np.arange(n)

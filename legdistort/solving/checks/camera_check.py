@@ -7,6 +7,8 @@ import numpy as np
 
 from ...cameras import ties
 from ...cameras.header_layout import FAR, LEAST, compare_headers
+from ...geometry import similarity
+from ...matching.detector_places import REACH, TURNS
 from ...results.check import WRONG, Check, FactorTest, state_of
 from .known_effects import DEPARTURES, LAYOUT, STATICS
 from .limits import SEEN, addition_that_shows, as_one
@@ -21,7 +23,7 @@ _TIE = (
     "more stars that dithers larger than the gaps carry from one detector to the others, a reference with stars "
     "on them (--reference)"
 )
-_STATE = ", or what is known of the layout (--layout-sigma, a camera file); --layout hold takes it as exact"
+_STATE = ", or what is known of the layout (--layout-sigma, a camera file){}; --layout hold takes it as exact"
 #: The same where headers are known to be wrong, which would be stated or held.
 _STATE_OTHER = ", or a camera file that was found otherwise (--camera): not what these headers state, which is wrong"
 _ODD = (
@@ -31,6 +33,10 @@ _ODD = (
 _UNDECIDED = (
     "the positions of the stars do not count on these headers, the sky does, by so much: tie it to a catalogue "
     "(--reference); legdistort attach then writes better headers"
+)
+_NEARER = (
+    "a layout that is nearer, by better headers or a camera file (--camera), if these dithers are larger than the "
+    f"gaps: stars are looked for to {REACH:.0f} px and {np.degrees(TURNS[-1]):.0f} degree from where it has them"
 )
 _TELL = "dithers larger than the gaps, which carry stars from one detector to the others, test it"
 
@@ -59,11 +65,17 @@ def camera_check(solution, residuals, observed, *, camera, contradicted, error, 
     held = [effect for effect, is_held in held.items() if is_held]
     stated, apart = _stated(solution, camera and camera.departure), undetermined(solution)
     headers = _headers_by_group(solution) if apart else _headers(solution, free[:3].any())
-    apart = Check("camera", "unknown", None, None, *apart) if apart else _few(solution, free[:3].any())
+    if apart:
+        apart = Check("camera", "unknown", None, None, *apart)
+        if (missed := _missed(solution)) >= _FEWEST:
+            words = f"{apart.sentence}, but by the layout {missed} stars are seen by several of them: it may be wrong"
+            apart = replace(apart, state="warn", sentence=words, cure=_NEARER)
+    else:
+        apart = _few(solution, free[:3].any())
     given = _held(held, solution.camera.name, residuals, observed, error, judged)
     if contradicted is not None:
         given = contradicted if given is None else replace(contradicted, tests=given.tests)
-    return as_one([given, stated, apart, headers])
+    return as_one([apart, given, stated, headers])
 
 
 def _few(solution, found):
@@ -74,9 +86,14 @@ def _few(solution, found):
         return None
     words = f"how groups of detectors lie to each other rests on {ties.in_words(few)}: a wrong one would not show"
     headers = solution.camera.headers
-    wrong = headers is not None and (bool(headers.odd) or headers.is_undecided)
-    cure = _TIE + (_STATE_OTHER if wrong else _STATE)
+    cure = _tying(solution, headers is not None and (bool(headers.odd) or headers.is_undecided))
     return Check("camera", "warn", float(min(number for *_, number in few)), float(ties.FEWEST), words, cure)
+
+
+def _tying(solution, wrong):
+    """The cure of detectors that stars do not tie, or few, by headers that are known to be `wrong` or not."""
+    instead = " in place of --layout fit" * (solution.settings.layout == "fit")
+    return _TIE + (_STATE_OTHER if wrong else _STATE.format(instead))
 
 
 def _headers_by_group(solution):
@@ -175,7 +192,19 @@ def undetermined(solution):
         return None
     apart = ties.apart(solution.camera, solution.residuals)
     words = f"these exposures do not determine how the detectors lie to each other{f' ({apart})' * bool(apart)}"
-    return words, _TIE + (_STATE if _headers_by_group(solution) is None else _STATE_OTHER)
+    return words, f"{_tying(solution, _headers_by_group(solution) is not None)}; {_NEARER}"
+
+
+def _missed(solution):
+    """Number of stars that by the layout exposures show on detectors of another group than that which has them."""
+    camera, used = solution.camera, solution.residuals[np.asarray(solution.residuals["used"], dtype=bool)]
+    group, ids = camera.group_of(used), camera.ids(used)
+    of_detector = np.array([group[ids == key].max(initial=-1) for key in camera.detectors])
+    stars, first = np.unique(np.asarray(used["star"]), return_index=True)
+    xy = solution.estimate.positions[np.searchsorted(solution.estimate.star_names, stars)]
+    elsewhere = (of_detector[:, None] >= 0) & (of_detector[:, None] != group[first])
+    on = [camera.sees(similarity.apply(pose, xy)) & elsewhere for pose in solution.poses.values()]
+    return int(np.count_nonzero(np.any(on, axis=(0, 1))))
 
 
 def _held(effects, name, residuals, observed, error, judged):

@@ -19,7 +19,7 @@ from ...results.errors.header_pointing import CURE as POINTING_CURE
 from ..terms.observed import Observed
 from .camera_check import camera_check, contradicted_layout, undetermined
 from .cures import with_cures, without_static
-from .dynamic_check import dynamic_check, nights_check, significance
+from .dynamic_check import EVIDENCE, dynamic_check, nights_check, significance
 from .limits import ALIKE, ASKED, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
 from .reference_check import reference_check
@@ -310,11 +310,11 @@ def degree_check(solution, residuals, *, shows_static):
                      f"degree {more} would explain {score.rms:.2g} px rms more (typical error of a star "
                      f"{error:.2g} px)",
                      f"--degree {more}, or --degree auto")  # fmt: skip
-    p = significance(solution, residuals.blocks, top_only=True)
+    p = significance(solution, top_only=True)
     if solution.degree > 1 and p > 0.05 and not solution.diagnostics.prior_has_widths:
         return Check("degree", "warn", score.rms, error,
                      f"no exposure has modes of degree {solution.degree} beyond noise",
-                     f"--degree {solution.degree - 1} fits as well, with smaller errors")  # fmt: skip
+                     f"--degree {solution.degree - 1}, or {EVIDENCE}")  # fmt: skip
     found = f"degree {more} would explain nothing more{little}"
     if not shows_static:
         found += " of what changes between exposures; what they have in common would go into the stars"
@@ -345,7 +345,7 @@ def _by_headers(solution, unknown):
         return ""
     words = "; or say how well headers know the poses (--pose-sigma shift=PIXELS,rotation=DEGREES)"
     free = camera is not None and camera.headers is not None and settings.layout_sigma is None
-    if free and settings.layout != "hold" and unknown == ("shear",):
+    if free and settings.layout in (None, "prior") and unknown == ("shear",):
         words += " or the layout (--layout-sigma shift=PIXELS,rotation=DEGREES)"
     return words
 
