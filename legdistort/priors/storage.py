@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 
 import asdf
+import numpy as np
 
 from ..cameras.camera import Camera
 from ..cameras.source import check_shape
@@ -117,7 +118,9 @@ def of_solution(solution, kind, source):
     if len(shapes) > 1:
         name = source.get("name", "the solution")
         raise InputError(f"{name} has detectors of several shapes, {sorted(shapes)}; it gives no single prior")
-    known = {"shape": shapes.pop(), "source": {"kind": "solution"} | source}
+    tables = [each.distortion.table for each in solution if each.distortion.table is not None]
+    left = max((float(np.hypot(*table.values).max()) for table in tables), default=0.0)
+    known = {"shape": shapes.pop(), "source": {"kind": "solution"} | source, "truncation": left}
     statics = found(solution).statics
     if len(statics) != 1:
         return kind(solution.coefficients.mean(axis=0), **known)

@@ -8,7 +8,7 @@ the Legendre modes up to a degree can do is taken off every function, so that no
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -94,19 +94,15 @@ class RoughBasis:
         splines = sparse.csr_array((value.ravel(), column.ravel(), rows), shape=(len(u), self.n))
         return splines, basis.values(self.degree, u, v)
 
-    @cached_property
-    def _made(self):
-        return _made(self.splines, self.degree, self.shape)
-
     @property
     def _root(self):
         """Coefficients of splines (n, n), of every function."""
-        return self._made[0]
+        return _made(self.splines, self.degree, self.shape)[0]
 
     @property
     def _taken_off(self):
         """Legendre modes (n_modes, n) of every spline."""
-        return self._made[1]
+        return _made(self.splines, self.degree, self.shape)[1]
 
 
 @lru_cache(maxsize=8)
