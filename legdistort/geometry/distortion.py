@@ -251,11 +251,15 @@ class Distortion(ShownAsPrinted):
         def remaining(p):
             return self.invert(p) - self._corrected(smooth.tensors, p)
 
+        good = []
         for part in _FINER:
             rest = DisplacementTable.of(remaining, self.shape, (part * table.step[0], part * table.step[1]), margin=0)
             error = self.round_trip_error(smooth.tensors, check, rest)
+            good += [Inverse(smooth.tensors, error, box, rest)] * (error <= self.tolerance)
             if error <= self.tolerance / 2:
-                return Inverse(smooth.tensors, error, box, rest)
+                break
+        if good:
+            return good[-1]
         raise FoldError(
             f"no inverse of the distortion{f' of exposure {self.name}' if self.name else ''} by a table is better than "
             f"{error:.1e} px ({self.tolerance:.0e} is wanted): its own table is too ragged, give one with finer steps"

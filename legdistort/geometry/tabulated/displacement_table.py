@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from astropy.modeling import models
+from scipy.interpolate import RectBivariateSpline
 
 from ...exceptions import InputError
 from ...runtime.trees.facts import array, number
@@ -125,6 +125,16 @@ class DisplacementTable:
         values = np.stack([np.asarray(model.lookup_table, dtype=float).T for model in (along_x, along_y)])
         return cls(values, tuple(first), tuple(step))
 
+    def refined(self, times: int) -> DisplacementTable:
+        """With `times` as many cells along an axis, whose nodes lie on cubic splines through those of this one."""
+        ny, nx = self.values.shape[1:]
+        x, y = (np.linspace(0, n - 1, times * (n - 1) + 1) for n in (nx, ny))
+        order = min(nx - 1, 3), min(ny - 1, 3)
+        values = [
+            RectBivariateSpline(np.arange(ny), np.arange(nx), v, kx=order[1], ky=order[0])(y, x) for v in self.values
+        ]
+        return DisplacementTable(np.stack(values), self.first, (self.step[0] / times, self.step[1] / times))
+
     def __call__(self, q: ArrayLike) -> np.ndarray:
         """Displacements (n, 2) at positions (n, 2)."""
         return interpolated(self.values, self.first, self.step, q)
@@ -163,7 +173,6 @@ class DisplacementTable:
         alike = (self.first, self.step) == (other.first, other.step)
         return alike and np.array_equal(self.values, other.values)
 
-    __hash__ = None  # type: ignore[assignment]
 
     def models(self) -> tuple[Model, Model]:
         """Displacements along x and along y as astropy models of (x, y)."""

@@ -39,6 +39,7 @@ _ORDER = (
 )  # fmt: skip
 #: What only residuals tell, and what to do where they tell nothing.
 _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degree, or add stars or exposures"
+_NO_DOF = "no degrees of freedom are left to judge it by"
 _PASSES = f"passes (chance, or errors right to {100 * NEGLIGIBLE:.0f} %)"
 _TELL_STATIC = "dithers by a good part of the field, or a turned camera, show it"
 _TOO_MUCH = 0.5  # of a frame without stars around
@@ -72,7 +73,9 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     observed = Observed(problem, state, solution.residuals[problem.order], times[0], solution.sky, solution.camera)
     several = problem.n_exposures > 1  # errors are not found from one
     contradicted = None if observed.detector is None else contradicted_layout(solution, uncertainty.camera)
-    if contradicted is None and several and residuals.dof >= 1 and any(c.state in WRONG for c in made.values()):
+    has_fields = bool(solution.estimate.table_errors)  # beside which residuals are smaller than errors, and correlated
+    may_be = contradicted is None and several and residuals.dof >= 1 and not has_fields
+    if may_be and any(check.state in WRONG for check in made.values()):
         made, explained = with_cures(made, solution, residuals, observed, judged)
     others = (
         dynamic_check(solution, problem, blocks),
@@ -99,8 +102,9 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     made |= {check.name: check for check in others if check is not None}
     made["absolute"] = absolute_check(solution, made)
     made = [made[name] for name in _ORDER if made.get(name) is not None]
-    if residuals.dof < 1:
-        made = [_unjudged(check) if check.name in _BY_RESIDUALS else check for check in made]
+    if residuals.dof < 1 or has_fields:
+        why, cure = ("random fields of exposures take up such patterns", "") if has_fields else (_NO_DOF, _MORE)
+        made = [Check(c.name, "unknown", None, None, why, cure) if c.name in _BY_RESIDUALS else c for c in made]
     if contradicted is not None:  # of residuals that it makes nothing else is told
         wrong = {check.name for check in made if check.state in WRONG} - {"camera"}
         return tuple(replace(c, cure="see camera first, which is the cause") if c.name in wrong else c for c in made)
@@ -120,11 +124,6 @@ def _by_residuals(solution, residuals, *, times):
         duplicates_check(solution, residuals),
     )
     return {check.name: check for check in made if check is not None}
-
-
-def _unjudged(check):
-    """A check that only residuals could tell, where they have no degrees of freedom."""
-    return Check(check.name, "unknown", None, None, "no degrees of freedom are left to judge it by", _MORE)
 
 
 def _causes_first(checks, explained):
@@ -182,6 +181,8 @@ def _errors_in_force(solution):
 def errors_check(solution, residuals):
     """Do residuals scatter as the errors in force lead to expect?"""
     chi2, dof = residuals.chi2 / solution.diagnostics.error_scale**2, residuals.dof
+    if solution.estimate.table_errors:  # whose share is in the degrees of freedom of all alone
+        chi2, dof = solution.chi2 / solution.diagnostics.error_scale**2, solution.dof
     if dof < 1:
         held = solution.dof - dof
         beside = f" beside {'that' if held == 1 else f'the {held:.0f}'} of the common map that is held" * (held >= 1)

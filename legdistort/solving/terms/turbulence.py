@@ -37,8 +37,8 @@ _ROUNDS, _UNSETTLED = 4, 0.6
 _EXPLAINED = 1.0
 #: Unknowns of stars and exposures together, and stars of an exposure, at most.
 _MOST, _MOST_STARS = 5000, 2500
-#: Cells of the tables of a field by its length, and along an axis at least and at most.
-_NODES_A_LENGTH, _NODES = 4, (32, 128)
+#: Cells of the tables of a field by its length, and along an axis at least and at most; into how many each is divided.
+_NODES_A_LENGTH, _NODES, _FINER = 4, (32, 128), 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +152,8 @@ class Field:
         made = []
         for i, shape in enumerate(shapes):
             step = np.clip(self.found.kernel.length / _NODES_A_LENGTH, *(max(shape) / np.array(_NODES[::-1])))
-            made.append(DisplacementTable.of(lambda q, i=i: self.at(i, q), shape, step))
+            coarse = DisplacementTable.of(lambda q, i=i: self.at(i, q), shape, step)
+            made.append(coarse.refined(_FINER))
         return made
 
 
