@@ -129,17 +129,3 @@ def test_where_it_cannot_be(mask):
     if matches.camera.has_focal_plane:
         with pytest.raises(InputError, match=r"rough_static is of detectors by .*dynamic='detector'"):
             ld.solve(matches, degree=2, terms="rough_static")
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:poses depart")  # which does not count the errors of terms
-def test_pinholes_of_a_large_detector():
-    """A map of 1 px rms beyond degree 5, where degree 17 leaves many times the noise."""
-    mask = Mask()
-    q = mask.at()
-    solution = mask.solve(terms="rough_static")
-    optimum = np.std(beyond(mask.optimum(q)[0] - mask.map(q), q, mask.size, 2))
-    assert off(mask, solution, q) < 1.5 * optimum
-    assert_allclose(solution.chi2 / solution.dof, 1, atol=0.05)
-    with pytest.warns(AssumptionWarning, match="poses depart"):
-        assert off(mask, mask.solve(degree=17), q) > 10 * optimum

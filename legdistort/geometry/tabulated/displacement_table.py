@@ -173,7 +173,6 @@ class DisplacementTable:
         alike = (self.first, self.step) == (other.first, other.step)
         return alike and np.array_equal(self.values, other.values)
 
-
     def models(self) -> tuple[Model, Model]:
         """Displacements along x and along y as astropy models of (x, y)."""
         points = tuple(

@@ -12,6 +12,7 @@ from scipy.optimize import brentq
 from ...geometry import basis
 from ...results.check import FALSE_ALARM, STATES, WRONG
 from ...results.diagnostics import ErrorLaw
+from ..terms.turbulence import can_be_found
 from .known_effects import MOTIONS, SHARE, effects_in
 from .smooth_fields import smooth_fields
 
@@ -77,7 +78,9 @@ def with_cures(checks, solution, residuals, observed, judged):
         return checks, explained
     fields = smooth_fields(left)
     own = without_static(solution) if solution.settings.static == "fit" and observed.detector is None else ""
-    return checks | {name: _with_fields(checks[name], fields, own) for name in wrong if name in _BY_FIELDS}, explained
+    found = observed.detector is None and not solution.settings.terms and can_be_found(observed.problem)
+    concerned = [name for name in wrong if name in _BY_FIELDS]
+    return checks | {name: _with_fields(checks[name], fields, own, found) for name in concerned}, explained
 
 
 def without_static(solution):
@@ -119,11 +122,12 @@ def _is_better(after, before):
     return STATES.index(after.state) < STATES.index(before.state)
 
 
-def _with_fields(check, fields, cure):
+def _with_fields(check, fields, cure, can_be_term):
     """A check that names smooth fields, if they are a reason for what it found, with a cure if there is one."""
     if not fields.are_there or (check.name == "chi2" and fields.share * check.value < SHARE * (check.value - 1)):
         return check
-    words = "neighbouring stars of an exposure are displaced alike, in every exposure in another way (turbulence), by "
+    words = "neighbouring stars of an exposure are displaced alike, in every exposure in another way (turbulence"
+    words += ", which --term turbulence finds), by " if can_be_term else "), by "
     return replace(check, sentence=f"{check.sentence}; {words}{fields.rms:.2g} px rms", cure=cure or check.cure)
 
 

@@ -220,6 +220,12 @@ class _Unknowns:
         return changes[:first].reshape(shapes[0]), changes[first:].reshape(shapes[1])
 
 
+def can_be_found(problem):
+    """Whether a `Problem` is small enough."""
+    n = problem.n_stars * problem.n_star + problem.n_exposures * 2 * problem.n_modes
+    return bool(n <= _MOST and np.diff(problem.start).max() <= _MOST_STARS)
+
+
 def field_of(fit, displaced, near=None, *, scale=False, weight=None):
     """The `Field` at a fit to positions with displacements (2, n) taken off; None where none is seen.
 
@@ -244,7 +250,7 @@ def field_of(fit, displaced, near=None, *, scale=False, weight=None):
     unknowns = _Unknowns(problem.n_stars, problem.n_star, problem.n_exposures, blocks.g_exposure.shape[1])
     parts = _parts(problem, blocks, fit.result.state, displaced, problem.weight if weight is None else weight)
     largest = max(len(part.rows) for part in parts)
-    if unknowns.size > _MOST or largest > _MOST_STARS:
+    if not can_be_found(problem):
         raise SolveError(
             f"turbulence of {problem.n_stars} stars in {problem.n_exposures} exposures has {unknowns.size} unknowns, "
             f"{2 * largest} values an exposure: at most {_MOST} and {2 * _MOST_STARS} can be done at once, give fewer "
