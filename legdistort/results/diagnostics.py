@@ -355,6 +355,9 @@ class FittedTerm:
             drawn = f", {shown['axis ratio']:.2g} times as long along {shown['angle']:.0f} deg from x"
             what = f"a field of every exposure, {self.size:.2g} px over lengths of {shown['length']:.3g} px"
             what += drawn * (shown["axis ratio"] > 1)
+            if "factor on x errors" in shown:
+                x, y = (shown[f"factor on {axis} errors"] for axis in "xy")
+                what += f", beside {x:.2f} and {y:.2f} times the stated errors in x and y"
             return f"{self.name}: {what}; it displaces positions by {self.rms:.2g} px rms per axis ({seen})"
         n, owners = len(self.values), list(dict.fromkeys(self.owners))
         if n == 1:

@@ -254,13 +254,12 @@ def solve(
         options = replace(options, degree=form.degree, model=None, prior=form.prior())
     given, kept_out = (matches, None) if validate is None else hold_out(matches, validate)
     with single_fit.threads(given), minimisers.iterations_shown(progress):
-        join = reference_tie.joined_by(catalogue, epoch=epoch, pixel_scale=pixel_scale)
-        fit, found, (options, chosen) = fit_with(asked.terms, _fitted, given, options, sought, join)
+        join, tie = reference_tie.ties_to(catalogue, epoch=epoch, pixel_scale=pixel_scale)
+        fit, found, (options, chosen) = fit_with(asked.terms, tie, _fitted, given, options, sought, join)
         _tell(fit, given)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
         diagnostics = replace(_diagnostics(fit, prior, scale), pointing=given.pointing, terms=found(scale), **chosen)
-        how = {"scale": scale, "epoch": epoch, "pixel_scale": pixel_scale}
-        fit = _placed(fit, sought, given) if catalogue is None else reference_tie.tie_to(fit, catalogue, **how)
+        fit = _placed(fit, sought, given) if tie is None else tie(fit, scale=scale)
     epoch = given.epoch if epoch is None else epoch
     sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
     found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue), epoch=epoch)

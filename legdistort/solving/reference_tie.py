@@ -483,13 +483,16 @@ def _identified(fit, reference, epoch, pixel_scale):
     )
 
 
-def joined_by(reference, **tying):
-    """What makes of the `Fit` of a camera one in which the stars of a reference tie detectors that no star ties.
+def ties_to(reference, **tying):
+    """What ties a `Fit` to a reference, ``join(fit)`` and ``tie(fit)``; None and None without one.
 
-    ``join(fit)``: with these stars as a prior, by which J determines the plane too; None without a reference. Where
-    stars move the fit stays as it is.
+    `join` makes of the fit of a camera one in which the stars of the reference tie detectors that no star ties: with
+    these stars as a prior, by which J determines the plane too. Where stars move the fit stays as it is. `tie` is
+    `tie_to`.
     """
-    return None if reference is None else partial(_joined, reference=reference, **tying)
+    if reference is None:
+        return None, None
+    return partial(_joined, reference=reference, **tying), partial(tie_to, reference=reference, **tying)
 
 
 def _joined(fit, *, reference, epoch, pixel_scale):

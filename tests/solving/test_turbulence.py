@@ -3,7 +3,9 @@
 import gwcs
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.modeling.models import Tabular2D
+from astropy.table import QTable
 from displaced_fields import displaced_by, optimum, sky, squared_pull
 from numpy.testing import assert_allclose
 from scipy.special import gamma, kv
@@ -130,7 +132,7 @@ def test_what_cannot_be_done_is_said():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("rms", "n_sets"), [(0.1, 16), (0.5, 16), (2.0, 12)])
+@pytest.mark.parametrize(("rms", "n_sets"), [(0.1, 10), (2.0, 6)])
 def test_errors_are_calibrated(rms, n_sets):
     """Of stars, and of others that took no part."""
     squares, pulls, least = [], [], []
@@ -142,6 +144,53 @@ def test_errors_are_calibrated(rms, n_sets):
         pulls.append(others.pull(solution))
         least.append(optimum(field, lambda a, b: covariance(a, b, rms=rms)))
     off, stated, _ = np.sum(squares, axis=0)
-    assert_allclose(off / stated, 1, atol=0.12)
-    assert_allclose(np.mean(pulls), 1, atol=0.15)
+    assert_allclose(off / stated, 1, atol=0.2)
+    assert_allclose(np.mean(pulls), 1, atol=0.2)
     assert np.sqrt(np.mean([s[0] / s[2] / 2 for s in squares])) < 1.2 * np.sqrt(np.mean(least))
+
+
+def one_exposure(seed, *, rms, n_known=400, n_others=60):
+    """A `Matches`, a catalogue of most stars, the true positions, and rows of the others."""
+    rng, n = np.random.default_rng(seed), n_known + n_others
+    stars = rng.uniform(50, 1998, (n, 2))
+    seen = stars + rng.normal(0, 0.01, (n, 2)) + (screens(1, seed, rms=rms)[0](stars) if rms else 0)
+    table = QTable({"exposure": ["e00"] * n, "star": np.arange(n)})
+    table["x"], table["y"] = seen.T * u.pix
+    table["x_err"] = table["y_err"] = np.full(n, 0.02) * u.pix  # twice what they are
+    catalogue = QTable({"star": np.arange(n_known)})
+    catalogue["x"], catalogue["y"] = stars[:n_known].T * u.pix
+    catalogue["x_err"] = catalogue["y_err"] = np.full(n_known, 1e-4) * u.pix
+    return ld.Matches.from_table(table, shape=(2048, 2048)), catalogue, stars
+
+
+@pytest.mark.filterwarnings("ignore:the offsets of the stars from the reference")
+def test_one_exposure_has_its_field_from_a_catalogue():
+    """Stars that the catalogue has not are right within their errors, and so is the factor on stated errors."""
+    matches, catalogue, stars = one_exposure(41, rms=0.1)
+    solution = ld.solve(matches, reference=catalogue, terms="turbulence")
+    found = dict(zip(solution.terms["number"], solution.terms["value"], strict=True))
+    for axis in "xy":
+        assert_allclose(found[f"factor on {axis} errors"], 0.5, rtol=0.3)
+    assert "times the stated errors in x and y" in solution.diagnostics.in_words()["terms"]
+    others = np.asarray(solution.stars["star"]) >= len(catalogue)
+    off = np.column_stack([solution.stars[name].value for name in "xy"]) - stars[np.asarray(solution.stars["star"])]
+    error = np.column_stack([solution.stars[f"{name}_err_abs"].value for name in "xy"])
+    plain = ld.solve(matches, reference=catalogue)
+    assert np.sqrt(np.mean(off[others] ** 2)) < 0.045
+    assert 0.4 < squared_pull(off[others], error[others]) < 1.4
+    new = np.random.default_rng(42).uniform(100, 1900, (300, 2))
+    seen = new + screens(1, 41, rms=0.1)[0](new)
+    corrected = solution["e00"].correct(seen, errors=np.zeros((300, 2)))
+    pulls = np.einsum("na,nab,nb->n", corrected.xy - new, np.linalg.inv(corrected.absolute), corrected.xy - new) / 2
+    assert 0.6 < np.mean(pulls) < 1.5
+    assert np.std(corrected.xy - new) < 0.6 * np.std(plain["e00"].correct(seen) - new)
+
+
+@pytest.mark.filterwarnings("ignore:the offsets of the stars from the reference")
+def test_one_exposure_without_turbulence_has_none():
+    matches, catalogue, _ = one_exposure(43, rms=0, n_known=200)
+    plain, solution = (ld.solve(matches, reference=catalogue, terms=terms) for terms in ((), "turbulence"))
+    assert "turbulence: the positions do not show it" in str(solution)
+    assert_allclose(solution.stars["x"], plain.stars["x"], rtol=1e-9)
+    matches, catalogue, _ = one_exposure(44, rms=0.1, n_known=25)  # too few to tell
+    assert "do not show it" in str(ld.solve(matches, reference=catalogue, terms="turbulence"))

@@ -26,6 +26,7 @@ from ..equations.common_parts import followed, relative_responses, response
 from ..equations.elimination import inverse_star_blocks
 from ..equations.star_terms import unpacked
 from .displaced import FITS, SMALL, Tabled, displaced, taken_off, unclipped
+from .field_of_one import FieldOfOne, fit_with_field_of_one
 from .observed import Observed
 from .term import FIELD_NUMBERS, RandomField
 from .turbulence import SHOWN as FIELD_SHOWN
@@ -43,12 +44,14 @@ _FREE = 1e4
 _MOST, _VALUES = 3000, 100_000_000
 
 
-def fit_with(terms, estimate, matches, options, *how):
+def fit_with(terms, tie, estimate, matches, options, *how):
     """What `estimate` gives, with the terms found beside.
 
     Parameters
     ----------
     terms : sequence of Term
+    tie : callable or None
+        ``tie(fit)`` is the fit tied to a reference; None without one.
     estimate : callable
         ``estimate(matches, options, *how)`` gives a `Fit` and what else there is.
     matches : Matches
@@ -73,7 +76,7 @@ def fit_with(terms, estimate, matches, options, *how):
         fit, *rest = estimate(matches, options, *how)
         return fit, lambda _: (), rest
     if any(isinstance(term, RandomField) for term in terms):
-        return _fit_with_field(terms, estimate, matches, options, *how)
+        return _fit_with_field(terms, tie, estimate, matches, options, *how)
     values, begun = {}, unclipped(estimate, matches, options, *how)
     for number in range(FITS):
         fit, *rest = begun or estimate(matches, options, *how)
@@ -91,19 +94,25 @@ def fit_with(terms, estimate, matches, options, *how):
     return fit, partial(numbers.found, step), rest
 
 
-def _fit_with_field(terms, estimate, matches, options, *how):
+def _fit_with_field(terms, tie, estimate, matches, options, *how):
     """`fit_with` of a random field alone."""
     if len(terms) > 1:
         others = " and ".join(term.name for term in terms if not isinstance(term, RandomField))
         raise SolveError(f"turbulence cannot be found beside other terms yet: leave out {others}, or turbulence")
-    fit, field, rest = fit_with_field(estimate, matches, options, *how)
-    kernel, seen = field.kernel, field.gain >= FIELD_SHOWN
-    shown = seen * np.array([kernel.size, kernel.length, kernel.ratio, kernel.angle])
-    moved = taken_off(fit)
+    if tie is not None and len(matches.names) == 1:
+        fit, field, rest = fit_with_field_of_one(estimate, tie, matches, options, *how)
+    else:
+        fit, field, rest = fit_with_field(estimate, matches, options, *how)
+    numbers, shown, gain = FIELD_NUMBERS, np.zeros(len(FIELD_NUMBERS)), 0.0 if field is None else field.gain
+    if field is not None and gain >= FIELD_SHOWN:
+        kernel = field.kernel
+        shown = np.array([kernel.size, kernel.length, kernel.ratio, kernel.angle])
+    if shown[0] and isinstance(field, FieldOfOne):
+        numbers, shown = (*numbers, "factor on x errors", "factor on y errors"), np.append(shown, field.factors)
     found = FittedTerm(
-        name=terms[0].name, unit=terms[0].unit, owner=terms[0].owner, size=float(shown[0]), gain=float(field.gain),
-        found=True, rms=float(np.sqrt(np.mean(moved**2))), n_asked=fit.problem.n_exposures,
-        owners=("",) * 4, numbers=FIELD_NUMBERS, values=tuple(shown.tolist()), errors=(),
+        name=terms[0].name, unit=terms[0].unit, owner=terms[0].owner, size=float(shown[0]), gain=float(gain),
+        found=True, rms=float(np.sqrt(np.mean(taken_off(fit) ** 2))), n_asked=fit.problem.n_exposures,
+        owners=("",) * len(numbers), numbers=numbers, values=tuple(shown.tolist()), errors=(),
     )  # fmt: skip
     return fit, lambda _: (found,), rest
 

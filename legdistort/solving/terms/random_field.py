@@ -69,22 +69,22 @@ class Kernel:
 
     def __call__(self, places, others):
         """Covariance (2 n, 2 m) of displacements at places (n, 2) and others (m, 2), pixels^2; x and y of each."""
-        metric = self.metric
-        shape = self.size * metric * self.length
-        u, v = (
-            np.subtract.outer(places @ metric[0], others @ metric[0]),
-            np.subtract.outer(places @ metric[1], others @ metric[1]),
-        )
+        blocks = self.blocks(*(np.subtract.outer(places @ row, others @ row) for row in self.metric))
+        return blocks.transpose(0, 2, 1, 3).reshape(2 * len(places), 2 * len(others))
+
+    def blocks(self, u, v):
+        """Covariances (..., 2, 2) of displacements that are M d = (u, v) apart."""
+        shape = self.size * self.metric * self.length
         far = np.sqrt(u * u + v * v)
         same, less = _radial(self.smoothness, far)
         less = less / np.maximum(far, _NEAR) ** 2
         turned = u * shape[0, 0] + v * shape[1, 0], u * shape[0, 1] + v * shape[1, 1]
-        square, out = shape.T @ shape, np.empty((len(places), 2, len(others), 2))
+        square, out = shape.T @ shape, np.empty((*far.shape, 2, 2))
         for a in (0, 1):
             pulled = less * turned[a]
             for b in (0, 1):
-                out[:, a, :, b] = same * square[a, b] - pulled * turned[b]
-        return out.reshape(2 * len(places), 2 * len(others))
+                out[..., a, b] = same * square[a, b] - pulled * turned[b]
+        return out
 
 
 def _radial(nu, far):

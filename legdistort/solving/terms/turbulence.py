@@ -281,7 +281,7 @@ def field_of(fit, displaced, near=None, *, scale=False, weight=None):
 def _parts(problem, blocks, state, displaced, weight):
     """The `_Part` of every exposure, with weights (3, n) of the observations."""
     parts = []
-    jacobian = _slopes(problem, blocks)
+    jacobian = slopes_of(problem, blocks)
     for i in range(problem.n_exposures):
         part = problem.part(i)
         rows = np.arange(part.start, part.stop)[(weight[0] * weight[1] - weight[2] ** 2)[part] > 0]
@@ -298,7 +298,7 @@ def _parts(problem, blocks, state, displaced, weight):
     return parts
 
 
-def _slopes(problem, blocks):
+def slopes_of(problem, blocks):
     """Derivatives (n, 2, p) of what is measured by the numbers of its star."""
     w, out = problem.weight, np.zeros((problem.xy.shape[1], 2, problem.n_star))
     det = w[0] * w[1] - w[2] ** 2
