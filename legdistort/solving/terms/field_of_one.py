@@ -16,8 +16,10 @@ from scipy.spatial import cKDTree
 
 from ...geometry.tabulated.covariance_table import CovarianceTable
 from ...geometry.tabulated.displacement_table import DisplacementTable
+from ...results.errors.absolute_errors import variances
 from ..equations.star_terms import unpacked
 from .displaced import Tabled, displaced, taken_off
+from .observed import undistorted
 from .random_field import DRAWN_OUT, Found, Kernel
 from .turbulence import SHOWN, slopes_of
 
@@ -67,7 +69,7 @@ class FieldOfOne:
 
     def seen(self, offsets, noise):
         """The same field, with other offsets and covariances of their noise as stated."""
-        return replace(self, offsets=offsets, noise=noise * np.multiply.outer(self.factors, self.factors))
+        return replace(self, offsets=offsets, noise=_times(noise, self.factors))
 
     def tables(self, shape):
         """`DisplacementTable` and `CovarianceTable` of the field over a detector."""
@@ -112,7 +114,7 @@ def field_in(places, offsets, noise):
     extent = np.ptp(places, axis=0).max()
 
     def deviance(kernel, factors, targets):
-        scaled = noise * np.sqrt(np.multiply.outer(factors, factors))
+        scaled = _times(noise, np.sqrt(factors))
         at, near = order[targets], order[given[targets]]
         metric = kernel.metric
         stars, where = places[near] @ metric.T, places[at] @ metric.T
@@ -126,8 +128,7 @@ def field_in(places, offsets, noise):
         """Without a field: factors alone."""
         at = order[targets]
         squares = offsets[at] ** 2 / noise[at][:, [0, 1], [0, 1]]
-        factors = squares.mean(axis=0)
-        scaled = noise[at] * np.sqrt(np.multiply.outer(factors, factors))
+        scaled = _times(noise[at], np.sqrt(squares.mean(axis=0)))
         left = np.einsum("na,nab,nb->", offsets[at], np.linalg.inv(scaled), offsets[at])
         return float(np.sum(np.linalg.slogdet(scaled)[1]) + left)
 
@@ -148,8 +149,13 @@ def field_in(places, offsets, noise):
     plain = sought(nu, best[1], many)
     drawn = sought(nu, np.append(plain[1], [0.1, 0.1]), many)
     cost, _, kernel, factors = drawn if plain[0] - drawn[0] > DRAWN_OUT else plain
-    scaled = noise * np.sqrt(np.multiply.outer(factors, factors))
-    return FieldOfOne(places, offsets, scaled, Found(kernel, nothing(many) - cost), tuple(np.sqrt(factors).tolist()))
+    factors = tuple(np.sqrt(factors).tolist())
+    return FieldOfOne(places, offsets, _times(noise, factors), Found(kernel, nothing(many) - cost), factors)
+
+
+def _times(noise, factors):
+    """Covariances (n, 2, 2) of errors times factors along x and y."""
+    return noise * np.multiply.outer(factors, factors)
 
 
 def _before(places, k):
@@ -187,17 +193,15 @@ def fit_with_field_of_one(estimate, tie, matches, options, *how):
         one = field_in(places, offsets, noise) if one is None else replace(one, places=places).seen(offsets, noise)
         if one.gain < SHOWN:
             return fit, one, rest
-        problem, state = fit.problem, tied.result.state
-        everywhere = (state.poses[0][:, :2] @ state.stars[:2, problem.star] + state.poses[0][:, 2:]).T
-        field, covariance = one.at(everywhere)
+        problem = fit.problem
+        field, covariance = one.at(undistorted(problem, tied.result.state))
         change = (field.T - held)[:, rows]
         if np.sqrt(np.mean(change**2 / noise[:, [0, 1], [0, 1]].T)) < _SMALL:
             break
         matches = displaced(fit, field.T)
     back = np.linalg.inv(slopes)
-    of_star = back @ covariance @ back.mT
     shared = np.zeros((3, problem.n_stars))
-    shared[:, problem.star] = of_star[:, 0, 0], of_star[:, 1, 1], of_star[:, 0, 1]
+    shared[:, problem.star] = variances(back @ covariance @ back.mT)
     table, errors = one.tables(problem.shapes[0])
     name = problem.names[0]
     tabled = Tabled(np.zeros_like(problem.xy), own={name: table}, errors={name: errors})
@@ -214,15 +218,13 @@ def offsets_from(fit, slopes):
     slopes : ndarray, shape (n, 2, 2)
         Derivatives of what is measured by the place of its star.
     """
-    problem, blocks, state = fit.weighted, fit.blocks, fit.result.state
+    problem, blocks = fit.weighted, fit.blocks
     known = unpacked(problem.terms.catalogue.precision)[problem.star]
     w = problem.weight
     rows = np.flatnonzero((w[0] * w[1] - w[2] ** 2 > 0) & (np.linalg.det(known) > 0))
-    weight, slopes = np.array([[w[0], w[2]], [w[2], w[1]]])[:, :, rows].transpose(2, 0, 1), slopes[rows]
+    weight, slopes = unpacked(w[:, rows]), slopes[rows]
     believed = slopes @ np.linalg.inv(known[rows]) @ slopes.mT  # with a factor for offsets that are larger
     stated = believed / fit.result.gauge.tie.factor**2
     residual = blocks.residual[:, rows].T
     offsets = residual + np.einsum("nab,nbc,nc->na", believed, weight, residual)
-    pose = state.poses[0]
-    places = (pose[:, :2] @ state.stars[:2, problem.star[rows]] + pose[:, 2:]).T
-    return rows, places, offsets, np.linalg.inv(weight) + stated
+    return rows, undistorted(problem, fit.result.state)[rows], offsets, np.linalg.inv(weight) + stated

@@ -72,10 +72,7 @@ class Observed:
     @cached_property
     def undistorted(self):
         """Undistorted pixels of the observations by the model, (n, 2): where distortions act."""
-        problem, state = self.problem, self.state
-        x, y = problem.placed_at(self.exposure, state.stars[:, problem.star])
-        one = np.ones_like(x)
-        return np.einsum("nab,bn->na", state.poses[self.exposure], np.stack([x, y, one]))
+        return undistorted(self.problem, self.state)
 
     @cached_property
     def places_alone(self):
@@ -165,6 +162,12 @@ class Observed:
             turn = np.linalg.inv(linear) if inverse else linear
             turned[..., here] = np.einsum("ab,...bn->...an", turn, turned[..., here])
         return turned
+
+
+def undistorted(problem, state):
+    """Undistorted pixels (n, 2) of the observations of a problem, by its model at a state."""
+    x, y = problem.placed(state.stars)[:2]
+    return np.einsum("nab,bn->na", state.poses[problem.exposure], np.stack([x, y, np.ones_like(x)]))
 
 
 def _standard(values):

@@ -24,6 +24,7 @@ from ...results.errors.camera_errors import CameraErrors, unit_errors
 from ..equations.common_parts import Followed, relative_responses, response
 from ..equations.star_terms import unpacked
 from .displaced import SMALL, Tabled, displaced, taken_off, unclipped
+from .observed import undistorted
 from .random_field import Seen, most_likely
 
 #: Twice the gain in the logarithm of the likelihood from which a field is there: some numbers of it are sought.
@@ -79,8 +80,8 @@ class Field:
     found : legdistort.solving.terms.random_field.Found
     parts : list of _Part
     unknowns : _Unknowns
-    covariance : ndarray, shape (k, k)
-        Of stars and coefficients, P.
+    before, covariance : ndarray, shape (k, k)
+        Of stars and coefficients, P0 and P.
     change : ndarray, shape (k,)
         d.
     """
@@ -88,6 +89,7 @@ class Field:
     found: object
     parts: list
     unknowns: object
+    before: np.ndarray
     covariance: np.ndarray
     change: np.ndarray
 
@@ -267,34 +269,29 @@ def field_of(fit, displaced, near=None, *, scale=False, weight=None):
     if found[0].gain < SHOWN:
         return None, found
     parts = [part.at(found[0].kernel) for part in parts]
-    start = _covariance(fit, unknowns)
+    before = _covariance(fit, unknowns)
     less, pull = np.zeros((unknowns.size, unknowns.size)), np.zeros((unknowns.size, 1))
     for i, part in enumerate(parts):
         unknowns.add(less, part.seen, i, part.difference)
         y, residual = part.seen.y, part.seen.y - displaced[:, part.rows].T.ravel()
         pull += unknowns.gathered(part.seen, i, (part.inverse @ y - part.weighted(residual))[:, None])
-    covariance = np.linalg.solve(np.eye(unknowns.size) - start @ less, start)
+    covariance = np.linalg.solve(np.eye(unknowns.size) - before @ less, before)
     covariance = (covariance + covariance.T) / 2
-    return Field(found[0], parts, unknowns, covariance, (covariance @ pull)[:, 0]), found
+    return Field(found[0], parts, unknowns, before, covariance, (covariance @ pull)[:, 0]), found
 
 
 def _parts(problem, blocks, state, displaced, weight):
     """The `_Part` of every exposure, with weights (3, n) of the observations."""
     parts = []
-    jacobian = slopes_of(problem, blocks)
+    jacobian, places = slopes_of(problem, blocks), undistorted(problem, state)
+    held, stated = unpacked(problem.weight), unpacked(weight)
     for i in range(problem.n_exposures):
         part = problem.part(i)
         rows = np.arange(part.start, part.stop)[(weight[0] * weight[1] - weight[2] ** 2)[part] > 0]
-        held, matrix = (np.array([[w[0], w[2]], [w[2], w[1]]])[:, :, rows].transpose(2, 0, 1)
-                        for w in (problem.weight, weight))  # fmt: skip
-        star = problem.star[rows]
-        stars = problem.placed(state.stars)[:, rows] if problem.terms.n else state.stars[:2, star]
-        pose = state.poses[i]
-        places = (pose[:, :2] @ stars + pose[:, 2:]).T
-        offsets = (blocks.residual + displaced)[:, rows].T
+        offsets, noise = (blocks.residual + displaced)[:, rows].T, np.linalg.inv(stated[rows])
         m = blocks.g_exposure.shape[1] // 2
-        seen = Seen(places, offsets, np.linalg.inv(matrix), star, jacobian[rows], blocks.values[:m, rows])
-        parts.append(_Part(seen, rows, held))
+        seen = Seen(places[rows], offsets, noise, problem.star[rows], jacobian[rows], blocks.values[:m, rows])
+        parts.append(_Part(seen, rows, held[rows]))
     return parts
 
 
@@ -347,12 +344,6 @@ def responses(field, fit, root):
     return relative_responses(follow, np.eye(root.shape[1]), fit.result, weights, fit.problem.degree)
 
 
-def added_errors(field, fit):
-    """Independent errors of unit size by which stars and coefficients are worse for the field, (k, r)."""
-    added = field.covariance - _covariance(fit, field.unknowns)
-    return unit_errors((added + added.T) / 2)
-
-
 def fit_with_field(estimate, matches, options, *how):
     """What `estimate` gives, with the field of every exposure found beside; see `fit_with`.
 
@@ -403,7 +394,7 @@ def _beginning(estimate, matches, options, *how):
 def _with_field(fit, field):
     """The fit with the field in its errors, and with the tables of it."""
     problem, parts = fit.problem, len(fit.matches.camera.detectors)
-    added = responses(field, fit, added_errors(field, fit))
+    added = responses(field, fit, unit_errors(field.covariance - field.before))
     whole = responses(field, fit, unit_errors(field.covariance))
     known = fit.camera_errors or CameraErrors.nothing(parts, problem.n_exposures, problem.n_stars, added[1].shape[1])
     errors = {}
