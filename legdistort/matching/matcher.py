@@ -426,11 +426,16 @@ def _check_groups(groups, lists, names, left_out, tolerance):
     if len(large) > 1:
         raise apart(large, "match each group by itself; fields of one camera can be solved together then")
     if not large:
-        given = f"tolerance={tolerance:g} (--tolerance) is no reach of the search, but how far one star may lie apart"
-        raise MatchError(
+        message = (
             f"no two exposures show the same stars (tried {some_of(names, 6)}); check that they overlap and that the "
-            "detections are stars" + (f"; {given}: leave it out, it is found" if tolerance is not None else "")
         )
+        message += "detections are stars"
+        if tolerance is not None:
+            message += (
+                f"; tolerance={tolerance:g} (--tolerance) is no reach of the search, but how far one star may lie "
+            )
+            message += "apart: leave it out, it is found"
+        raise MatchError(message)
 
 
 def _ties_of_few(camera, table, star, min_exposures):
