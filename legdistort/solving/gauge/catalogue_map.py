@@ -11,6 +11,7 @@ tells nothing of g: with ``Q = 1 - F (F' W F)^-1 F' W``, W the inverse of their 
 
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import block_diag, eigh, lu_factor, lu_solve
@@ -161,14 +162,24 @@ class MapEquations:
         index = (self.offsets.rows[used, None] + [0, len(self.directions)]).ravel()
         return self.relative[np.ix_(index, index)]
 
+    def by_exposures(self, used, values):
+        """Values (m, 2 n) times what of that covariance is the exposures'."""
+        if self.dense:
+            return values @ self.of_exposures(used)
+        return np.einsum("mja,jab->mjb", values.reshape(len(values), -1, 2), self.own[used]).reshape(values.shape)
+
+    @cached_property
+    def precision(self):
+        """Inverse of the covariance (n, 2, 2) of every offset by itself."""
+        return np.linalg.inv(self.blocks)
+
     def _weighted(self, used, values, weights=None):
         """The inverse of that covariance times values (2 n, ...), factorised once for the same stars.
 
         With `weights` (n,) every star counts by itself, so much.
         """
         if weights is not None or not self.dense:
-            precision = np.linalg.inv(self.blocks[used])
-            precision = precision if weights is None else precision * weights[:, None, None]
+            precision = self.precision[used] if weights is None else self.precision[used] * weights[:, None, None]
             return (precision @ values.reshape(len(precision), 2, -1)).reshape(values.shape)
         key = used.tobytes()
         if key not in self._factors:
@@ -208,7 +219,11 @@ class MapEquations:
 
         Unit rms over the stars. Shift, rotation and scale count as determined wherever there is a star for them.
         """
-        information = self.prior.information + self.gain(used, weights)[0]
+        return self._determined(self.gain(used, weights)[0])
+
+    def _determined(self, information):
+        """The same, of the information in the offsets."""
+        information = self.prior.information + information
         curvature, maps = eigh((information + information.T) / 2, self.metric)
         similar = self.prior.modes.similar.T
         inside = similar @ np.linalg.solve(similar.T @ self.metric @ similar, similar.T @ self.metric @ maps)
@@ -218,9 +233,10 @@ class MapEquations:
 
     def solve(self, used, weights=None):
         """The map (2 k,), its covariance, and the matrix (2 k, 2 n) that takes used offsets to it."""
-        maps, curvature, _ = self.determined(used, weights)
+        information, weighted = self.gain(used, weights)
+        maps, curvature, _ = self._determined(information)
         covariance = maps / curvature @ maps.T
-        gain = covariance @ self.gain(used, weights)[1]
+        gain = covariance @ weighted
         value = covariance @ self.prior.information @ self.prior.centre + gain @ self.offsets.values[used].ravel()
         return value, covariance, gain
 
@@ -244,9 +260,7 @@ class MapEquations:
     def chi2(self, left, used, other=None):
         """That of what is left (n, 2) of the used offsets; or its product with something else of that kind."""
         left, other = left[used], (left if other is None else other)[used]
-        if self.dense:
-            return left.ravel() @ self._weighted(used, other.ravel())
-        return np.einsum("na,nab,nb->", left, np.linalg.inv(self.blocks[used]), other)
+        return left.ravel() @ self._weighted(used, other.ravel())
 
     def pulls(self, used):
         """Length of every offset less the map, in its standard errors; those of the used ones without their own say."""
@@ -265,7 +279,7 @@ class MapEquations:
         equal = np.ones(np.count_nonzero(used))
         value = self.solve(used, equal)[0]
         left, off = self.left(value, used, equal), value - self.prior.centre
-        return np.einsum("na,nab,nb->n", left, np.linalg.inv(self.blocks), left), off @ self.prior.information @ off
+        return np.einsum("na,nab,nb->n", left, self.precision, left), off @ self.prior.information @ off
 
 
 def _at_most(spread, blocks):
@@ -436,7 +450,7 @@ def estimate(equations, used, names):
         offsets=left,
         used=used,
         ratio=float(equations.chi2(left, used) / dof) if dof > 2 else np.nan,
-        freedom=float(np.einsum("km,ma,ka->", covariance, weighted, weighted @ equations.of_exposures(used))),
+        freedom=float(np.einsum("km,ma,ka->", covariance, weighted, equations.by_exposures(used, weighted))),
     )
     return value, tie, dof
 

@@ -98,12 +98,15 @@ class FieldOfOne:
 def _covariances(kernel, stars, places, noise):
     """Covariance (n, 2 k, 2 k) of offsets of stars (n, k, 2), and with the field at places, (n, 2 k, 2); in lengths."""
     n, k = stars.shape[:2]
-    apart = stars[:, :, None] - stars[:, None]
-    inner = kernel.blocks(apart[..., 0], apart[..., 1])
-    inner[:, np.arange(k), np.arange(k)] += noise
-    to_place = stars - places[:, None]
-    cross = kernel.blocks(to_place[..., 0], to_place[..., 1])
-    return inner.transpose(0, 1, 3, 2, 4).reshape(n, 2 * k, 2 * k), cross.reshape(n, 2 * k, 2)
+    first, second = np.triu_indices(k)
+    between = kernel.blocks(*np.moveaxis(stars[:, first] - stars[:, second], 2, 0))
+    between[:, first == second] += noise
+    pair, inner = np.empty((k, k), dtype=int), np.empty((n, k, 2, k, 2))
+    pair[first, second] = pair[second, first] = np.arange(len(first))  # covariances of two stars are symmetric
+    for a, b in np.ndindex(2, 2):
+        inner[:, :, a, :, b] = np.take(between[..., a, b], pair, axis=1)
+    cross = kernel.blocks(*np.moveaxis(stars - places[:, None], 2, 0))
+    return inner.reshape(n, 2 * k, 2 * k), cross.reshape(n, 2 * k, 2)
 
 
 def field_in(places, offsets, noise):
@@ -205,7 +208,9 @@ def fit_with_field_of_one(estimate, tie, matches, options, *how):
     table, errors = one.tables(problem.shapes[0])
     name = problem.names[0]
     tabled = Tabled(np.zeros_like(problem.xy), own={name: table}, errors={name: errors})
-    return replace(fit, shared_errors=shared, tabled=tabled), one, rest
+    freedom = float(np.einsum("nab,nba->", covariance[rows], np.linalg.inv(one.noise)))
+    unknowns = fit.shared_unknowns + freedom
+    return replace(fit, shared_errors=shared, shared_unknowns=unknowns, tabled=tabled), one, rest
 
 
 def offsets_from(fit, slopes):

@@ -80,10 +80,8 @@ class Kernel:
         less = less / np.maximum(far, _NEAR) ** 2
         turned = u * shape[0, 0] + v * shape[1, 0], u * shape[0, 1] + v * shape[1, 1]
         square, out = shape.T @ shape, np.empty((*far.shape, 2, 2))
-        for a in (0, 1):
-            pulled = less * turned[a]
-            for b in (0, 1):
-                out[..., a, b] = same * square[a, b] - pulled * turned[b]
+        for a, b in ((0, 0), (0, 1), (1, 1)):
+            out[..., a, b] = out[..., b, a] = same * square[a, b] - less * turned[a] * turned[b]
         return out
 
 
