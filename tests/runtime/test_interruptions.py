@@ -835,11 +835,11 @@ def test_the_disk_is_asked(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="kills.py is for Linux")
 def test_kills():
-    """See `kills.py`: thirteen calls, eight kills."""
+    """See `kills.py`: thirteen calls, four kills."""
     run = subprocess.run(
-        [sys.executable, HERE / "kills.py", "--kills", "8"], capture_output=True, text=True, check=False
+        [sys.executable, HERE / "kills.py", "--kills", "4"], capture_output=True, text=True, check=False
     )
     assert run.returncode == 0, run.stdout + run.stderr
     all_of_them = run.stdout.splitlines()[-1].split()
     assert all_of_them[0] == "all"
-    assert all_of_them[2] == "8"
+    assert all_of_them[2] == "4"

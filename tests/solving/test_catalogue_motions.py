@@ -71,9 +71,9 @@ def test_the_dense_oracle_agrees(kind, epochs):
     [
         (6, "proper", None, 0.2),
         (3, "parallax", None, 0.25),
-        pytest.param(60, "proper", None, 0.1, marks=pytest.mark.slow),
-        pytest.param(60, "proper", 0.3, 0.1, marks=pytest.mark.slow),
-        pytest.param(60, "parallax", None, 0.1, marks=pytest.mark.slow),
+        pytest.param(30, "proper", None, 0.1, marks=pytest.mark.slow),
+        pytest.param(30, "proper", 0.3, 0.1, marks=pytest.mark.slow),
+        pytest.param(30, "parallax", None, 0.1, marks=pytest.mark.slow),
     ],
 )
 def test_absolute_errors_are_calibrated(n, kind, sigma, accuracy):
