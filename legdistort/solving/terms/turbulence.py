@@ -32,8 +32,9 @@ SHOWN = 12.0
 #: Exposures, and stars, of which the likelihood is made at most: the sizes of the field are known well enough.
 _EXPOSURES, _STARS = 8, 60
 #: Fits at most, and the change in errors from which a warning says that they have not settled. Where the field is far
-#: larger than the errors of measurement, what these alone tell of the plane in second order goes back and forth.
-_ROUNDS, _UNSETTLED = 4, 0.6
+#: larger than the errors of measurement, what these alone tell of the plane in second order goes back and forth: then
+#: steps are half as large.
+_ROUNDS, _UNSETTLED = 6, 0.6
 #: chi2 by its degrees of freedom from which errors count as too small to begin with.
 _EXPLAINED = 1.0
 #: Unknowns of stars and exposures together, and stars of an exposure, at most.
@@ -355,7 +356,7 @@ def fit_with_field(estimate, matches, options, *how):
         Of the field; its gain is below `SHOWN` where none is seen.
     rest : tuple
     """
-    near, (begun, weight) = None, _beginning(estimate, matches, options, *how)
+    near, before, (begun, weight) = None, np.inf, _beginning(estimate, matches, options, *how)
     for _ in range(_ROUNDS):
         fit, *rest = begun or estimate(matches, options, *how)
         held = taken_off(fit)
@@ -364,6 +365,9 @@ def fit_with_field(estimate, matches, options, *how):
         if not begun and length < SMALL:
             break
         new = np.zeros_like(held) if field is None else field.displacements(held.shape[1])
+        if length > before / 2:
+            new = (held + new) / 2
+        before = length if not begun else np.inf
         matches = displaced(fit, new)
         begun = None
     if length > _UNSETTLED:
