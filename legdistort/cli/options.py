@@ -276,7 +276,7 @@ SOLVING = Group(
         ),
         "dynamic": Option("of a camera: what has a distortion of its own in every exposure", choices=words.DYNAMIC),
         "exposure_degree": Option(
-            "with --static fit: degree of what every exposure has for itself (default 1)", type=int
+            "with --static fit, of single detectors: degree of what every exposure has for itself (default 1)", type=int
         ),
         "loss": Option("(default linear)", choices=words.LOSSES),
         "clip": Option("leave out what deviates by more sigma; 0: nothing (default 5)", type=float, none=0),

@@ -86,6 +86,8 @@ def with_earlier(arguments):
 def how_to_forget(message, arguments):
     """What to add to a message about options that are repeated and contradict those that are given; else nothing."""
     repeated = getattr(arguments, "repeated", ())
+    if repeated:  # the folder may have the name of an option
+        message = message.replace(str(getattr(arguments, "from")), "")
     flags = [flag for flag in repeated if re.search(rf"(?<![\w-])({flag}|{_name(flag)})(?![\w-])", message)]
     if not flags:
         return ""

@@ -17,8 +17,8 @@ from .repeating import how_to_forget, with_earlier
 
 log = logging.getLogger("legdistort")
 
-#: The value of an argument as messages write it in Python: a dict, a tuple, a text, or a word or number.
-_VALUE = r"(?:\{[^{}]*\}|\([^()]*\)|'[^']*'|[^\s(){}',]*)"
+#: The value of an argument as messages write it in Python: a dict, a tuple, a call, a text, or a word or number.
+_VALUE = r"(?:\{[^{}]*\}|\([^()]*\)|[A-Z]\w*\([^()]*\)|'[^']*'|[^\s(){}',]*)"
 
 
 def run_command(arguments):
@@ -59,7 +59,7 @@ def in_shell_words(text):
     text = re.sub(rf"\b(?:\w+={_VALUE} or )*\w+=({_VALUE}),? \((--[^()]*)\)", _named_option, text)
     text = re.sub(r"\b(?:\w+=\{[^{}]*\}|\w+\(\w+=\.\.\.\)) or (?=--)", "", text)  # columns={...} or --columns
     text = re.sub(rf"\(\w+={_VALUE}, (--[^()]*)\)", r"(\1)", text)  # (earlier=, --from)
-    text = re.sub(r"(?<![-\w])([a-z_]+)=(?:'([\w-]+)'|(\d[\d.]*))", _as_option, text)
+    text = re.sub(r"(?<![-\w])(?<!\w\()([a-z_]+)=(?:'([\w-]+)'|(\d[\d.]*))", _as_option, text)
     return re.sub(r"(?<!\w)'([\w.,-]+)'(?!\w)", r"\1", text)
 
 

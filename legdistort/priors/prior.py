@@ -59,10 +59,10 @@ def _per_mode(value, n, name):
 
 def _declared(sigma, static_sigma):
     """The size of a static distortion of which nothing else is known, a positive number."""
-    if sigma is not None:
+    if not (sigma is None or (isinstance(sigma, str) and sigma == EVIDENCE)):
         raise InputError(
             "sigma is the scatter of exposures around a mean: give the mean as well, or leave sigma out; without one "
-            f"it is {EVIDENCE!r}, alone"
+            f"it is found, {EVIDENCE!r}"
         )
     given = isinstance(static_sigma, Real) and not isinstance(static_sigma, bool)
     if not (given and 0 < static_sigma < np.inf):
@@ -93,7 +93,7 @@ class Prior(ShownAsPrinted):
         the mean as exact, infinity means that nothing is known of a mode. Without a mean, a number s: every coefficient
         of the degree d that is fitted is about that large, in pixels, either sign. This makes
         ``s sqrt(((d + 1) (d + 2) - 4) / 8)`` px of distortion, rms per axis over the detector, shift, rotation and
-        scale aside: s at degree 2, 1.4 s at 3, 1.8 s at 4, 2.2 s at 5.
+        scale aside: s at degree 2, 1.4 s at 3, 1.8 s at 4, 2.2 s at 5; the scatter of exposures is then found.
     shape : tuple, optional
         ``(ny, nx)`` of the detector it belongs to; solving exposures of another shape with it is then an error.
     source : str or dict, optional
@@ -145,6 +145,7 @@ class Prior(ShownAsPrinted):
             object.__setattr__(self, "source", UNSTATED)
         if self.mean is None:
             object.__setattr__(self, "static_sigma", _declared(self.sigma, self.static_sigma))
+            object.__setattr__(self, "sigma", None)  # which is found
             return
         try:
             mean = np.array(self.mean, dtype=float)

@@ -109,12 +109,13 @@ def test_scatter_alone_is_found_about_what_exposures_show(tmp_path):
 
 
 def test_scatter_needs_a_mean():
-    with pytest.raises(InputError, match="without one it is 'evidence', alone"):
+    with pytest.raises(InputError, match="without one it is found, 'evidence'"):
         ld.Prior(None, sigma=0.3)
     with pytest.raises(InputError, match="sigma is the scatter of exposures around a mean"):
         ld.Prior(None, sigma=0.3, static_sigma=2.0)
-    with pytest.raises(InputError, match="scatter of exposures around a mean"):
-        ld.Prior(None, static_sigma=2.0).with_sigma("evidence")
+    declared = ld.Prior(None, static_sigma=2.0)
+    assert repr(declared.with_sigma("evidence")) == repr(declared)
+    assert declared.with_sigma("evidence").sigma is None
 
 
 def test_prior_says_what_it_is():

@@ -13,7 +13,7 @@ from ...geometry import basis
 from ...results.check import FALSE_ALARM, STATES, WRONG
 from ...results.diagnostics import ErrorLaw
 from ..terms.turbulence import can_be_found
-from .known_effects import MOTIONS, SHARE, effects_in
+from .known_effects import MOTIONS, SHARE, STATICS, effects_in
 from .smooth_fields import smooth_fields
 
 #: Part of what chi2 is too large by that an effect must explain to be named as its reason.
@@ -56,7 +56,7 @@ def with_cures(checks, solution, residuals, observed, judged):
         Those that do not pass for a reason that they name.
     """
     effects = effects_in(residuals, observed)
-    checks, explained = _named(checks, effects, judged)
+    checks, explained = _named(checks, effects, judged, static=solution.settings.static)
     wrong = [name for name, check in checks.items() if check.state in WRONG and name not in explained]
     if not wrong:
         return checks, explained
@@ -90,7 +90,7 @@ def without_static(solution):
     return f"leave --static fit out, which fits one distortion to all exposures{higher}"
 
 
-def _named(checks, effects, judged):
+def _named(checks, effects, judged, *, static):
     """Checks that name the effects which explain why they do not pass, and the names of these checks."""
     reasons, before = {}, checks
     for effect in effects:
@@ -105,7 +105,8 @@ def _named(checks, effects, judged):
         words = "; ".join(f"{each.words}, by {each.rms:.2g} px rms" for each, _ in found)
         last = found[-1][1]
         reached = f"chi2/dof would be {last.value:.2f}" if name == "chi2" else _WOULD[last.state]
-        cure = "; ".join(moving if each.effect is MOTIONS else each.effect.cure for each, _ in found)
+        cures = {MOTIONS: moving} | ({STATICS: "raise --degree"} if static == "fit" else {})
+        cure = "; ".join(cures.get(each.effect, each.effect.cure) for each, _ in found)
         check = checks[name]
         checks[name] = replace(check, sentence=f"{check.sentence}; {words}: without that {reached}", cure=cure)
     return checks, set(reasons)

@@ -28,9 +28,11 @@ def overlaps_check(solution, residuals):
     found = f"stars are {ratio:.2g} times as uncertain as their measurements"
     if ratio < _WORSE:
         return Check("overlaps", "pass", ratio, _WORSE, found)
+    free = solution.settings.prior is None and solution.diagnostics.widths is None
+    evidence = "--prior-sigma evidence, where exposures depart little from what they have in common; " * free
     return Check("overlaps", "warn", ratio, _WORSE, f"{found}: too few of them join the exposures",
-                 "exposures that overlap by more, fainter stars (a lower --threshold), a lower --degree, or a "
-                 "--reference")  # fmt: skip
+                 f"{evidence}exposures that overlap by more, fainter stars (a lower --threshold), a lower --degree, or "
+                 "a --reference")  # fmt: skip
 
 
 def stars_check(solution, observed):
