@@ -122,15 +122,18 @@ class CombinedNights(ShownAsPrinted):
         return np.array([each.n_nights > 1 for each in self.nights])
 
     @plain_numbers
-    def static(self, date: float | Time | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def static(self, date: float | Time | None = None, *, further_night: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """S at a date, normalised Legendre modes (2, n_modes), and its covariance (2 n_modes, 2 n_modes), pixels.
 
         Parameters
         ----------
         date : float or `~astropy.time.Time`, optional
             Julian year; that of the last night if not given. Without a drift it does not matter.
+        further_night : bool
+            Whether the covariance is that of a further night, with the scatter of nights.
         """
         mean, covariance = self._chain.at(self._year(date))
+        covariance = covariance + np.diag(self._widths**2) * further_night
         return (self._rows.T @ mean).reshape(2, -1), self._rows.T @ covariance @ self._rows
 
     @plain_numbers

@@ -259,7 +259,7 @@ def _model(nights, dates, degrees, drifts):
 
 
 def contradiction(chain, n, width):
-    """Whether a night contradicts all others: chi2, in how many directions, and the differences (K,) seen there.
+    """Whether a night contradicts all others: chi2, in how many directions, and the differences (K,) that are determined.
 
     `width` (K,) is the scatter of nights.
     """
@@ -269,4 +269,6 @@ def contradiction(chain, n, width):
     inside, power = vectors[:, seen].T, sizes[seen]
     away = inside @ chain.pull[n] / power - inside @ mean
     whole = inside @ (covariance + np.diag(width**2)) @ inside.T + np.diag(1 / power)
-    return float(away @ np.linalg.solve(whole, away)), int(seen.sum()), inside.T @ away
+    spread, turned = np.linalg.eigh(whole)
+    told = turned[:, spread < 1 / DETERMINED]  # by the others too
+    return float(away @ np.linalg.solve(whole, away)), int(seen.sum()), inside.T @ (told @ (told.T @ away))

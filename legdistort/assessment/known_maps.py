@@ -86,11 +86,22 @@ def known_map(thing, label, other=None):
         if thing.camera.has_focal_plane:
             return _of_focal_plane(thing, label)
         return _of_night(thing, label, next(iter(other.statics.values())) if other else None)
+    if isinstance(thing, Camera):
+        return _of_camera(thing, label)
     if not isinstance(thing, Prior):
-        return _of_camera(thing if isinstance(thing, Camera) else thing.camera(), label)
+        return _of_nights(thing, label)
     widths = thing.static_sigma
     covariance = None if widths is None else np.diag(np.minimum(widths.ravel(), _NOTHING) ** 2)
     return KnownMap(label, {"1": thing.mean}, {"1": thing.shape}, covariance)
+
+
+def _of_nights(nights, label):
+    """What a further night has, with all covariances; nothing where nights do not tell it."""
+    static, covariance = nights.static(further_night=True)
+    power, directions = np.linalg.eigh(covariance)
+    told = directions[:, power < 1 / DETERMINED]
+    static = (told @ (told.T @ static.ravel())).reshape(static.shape)
+    return KnownMap(nights.name if label.startswith("the ") else label, {"1": static}, {"1": nights.shape}, covariance)
 
 
 def _of_camera(camera, label):

@@ -22,8 +22,8 @@ from .star_lists import StarList, Warp, allowed_degree, fit_warp
 
 #: Exposures of a group with which a stray one is compared at any rotation.
 BLIND_TRIES = 8
-#: Pairs of an exposure registered at most, those of largest overlap first.
-PARTNERS = 6
+#: Pairs of an exposure registered at most: those of largest overlap, and as many of all others, evenly by overlap.
+PARTNERS = 3
 #: Stars that two exposures ought to share before a failure to register counts against them.
 ENOUGH = 25
 #: A pair is registered anew when it holds less than this part of the stars that the exposures share by all other pairs.
@@ -216,14 +216,20 @@ def _overlaps(lists, rough):
 
 
 def _partners(overlaps):
-    """The pairs worth registering: for every exposure those of largest overlap."""
+    """The pairs worth registering: for every exposure those of largest overlap, and some of any other overlap.
+
+    Where pointings are repeated the first are all of one pointing, and others would join stars that few pointings see.
+    """
     of_exposure = defaultdict(list)
     for pair, stars in overlaps.items():
         for exposure in pair if stars >= 3 else ():
             of_exposure[exposure].append(pair)
     chosen = set()
     for pairs in of_exposure.values():
-        chosen.update(sorted(pairs, key=lambda pair: -overlaps[pair])[:PARTNERS])
+        ordered = sorted(pairs, key=lambda pair: -overlaps[pair])
+        chosen.update(ordered[:PARTNERS])
+        rest = ordered[PARTNERS:]
+        chosen.update(rest[k] for k in np.linspace(0, len(rest) - 1, min(PARTNERS, len(rest))).astype(int))
     return sorted(chosen)
 
 

@@ -274,6 +274,26 @@ def test_an_odd_night_is_named_and_counts_less():
     assert "Odd nights, which count less: solution 4." in str(combined)
 
 
+def test_what_nights_of_one_orientation_do_not_determine_hides_no_odd_night(tmp_path):
+    """Some combinations of modes are unknown, to the coefficients of all of them: the others are known well."""
+    nights = [solved(600 + i, static(3) + curved(650 + i, 0.02), turns=(0,), year=2014 + i) for i in range(4)]
+    combined = ld.combine_nights(nights[:3])
+    assert np.sqrt(np.diag(combined.static()[1])).max() > 0.1
+    away = combined.table["departure"].value
+    assert away.max() < 0.1  # not of the unknown ones
+    assert ld.difference(combined, nights[3]).agrees
+    odd = solved(699, static(3) + curved(698, 0.5), turns=(0,), year=2018)
+    for camera in (combined, combined.write(tmp_path / "camera.asdf")):
+        found = ld.difference(camera, odd)
+        assert found.p < 1e-4
+        assert not found.agrees
+    static_, covariance = combined.static()
+    further = combined.static(further_night=True)
+    assert_array_equal(further[0], static_)
+    assert (np.diag(further[1]) >= np.diag(covariance)).all()
+    assert np.trace(further[1]) > np.trace(covariance)
+
+
 def test_a_camera_makes_the_next_night_absolute(three):
     """Exposures of one orientation alone leave shears and more unknown; the camera of the nights before knows them."""
     table = night(77, static(1) + curved(78, 0.02), turns=(0,), n_stars=70, exposures=6)

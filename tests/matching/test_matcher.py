@@ -117,6 +117,27 @@ def test_without_fluxes():
     assert np.all(np.diff(x) >= 0)
 
 
+def test_stars_of_few_pointings_are_joined_where_pointings_are_repeated():
+    """Eight lists of each of five pointings: the exposures nearest to one are those of its own pointing."""
+    rng = np.random.default_rng(5)
+    stars, flux = rng.uniform(-130, 1154, (300, 2)), 10 ** rng.uniform(2, 5, 300)
+    pointings, tables, true = rng.uniform(-100, 100, (5, 2)), [], []
+    for night in range(8):
+        for k, pointing in enumerate(pointings):
+            turn = np.radians(rng.normal(0, 0.3))
+            xy = (stars - 512) @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) + 512
+            xy = xy + pointing + rng.normal(0, 3, 2) + rng.normal(0, 0.03, xy.shape)
+            seen = np.flatnonzero(np.all((xy > 0) & (xy < 1023), axis=1) & (rng.random(300) < 0.95))
+            tables.append(detections(f"n{night}_{k}", xy[seen], flux=flux[seen]))
+            tables[-1]["truth"] = seen
+            true.append(seen)
+    found = match(vstack(tables), shape=(1024, 1024)).table
+    pairs = np.unique(np.column_stack([found["truth"], np.unique(found["star"], return_inverse=True)[1]]), axis=0)
+    names = np.bincount(pairs[:, 0])
+    assert np.count_nonzero(names > 1) <= 3  # of 270; 40 where the nearest exposures are all that are compared
+    assert (np.bincount(pairs[:, 1]) == 1).all()
+
+
 def test_large_offsets_and_scale():
     shifts = np.array([[0, 0], [1200, 0], [0, 1200], [600, 600], [1200, 1200], [300, -100]])
     table = make_field(300, [0, 0.3, 10, 0, 0, -20], shifts, seed=2)
