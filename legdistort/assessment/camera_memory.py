@@ -46,6 +46,7 @@ LAYOUT, ROOT = 1, "legdistort_nights"
 #: Chance below which one of all nights is odd.
 ALARM = 0.003
 _UNKNOWN = 100.0  # error of a coefficient [pix] from which on nothing is known of it
+_WEAK = 10  # errors of a combination in those of most, from which it is told apart
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -287,6 +288,18 @@ class CombinedNights(ShownAsPrinted):
             said.append(both if differ else "No night contradicts the others.")
         return said
 
+    def _said_of_weak(self):
+        """Combinations whose errors are far larger than those of most, which single coefficients do not show."""
+        error = np.sqrt(np.linalg.eigvalsh(self._chain.at(self._year(None))[1]))
+        weak = error > _WEAK * np.median(error)
+        if not weak.any():
+            return []
+        least, rest = np.min(error[weak]), np.sqrt(np.mean(error[~weak] ** 2))
+        return [
+            f"{np.count_nonzero(weak)} combinations are known to {least:.2g} px at best, and in the errors of all of "
+            f"their coefficients; the {np.count_nonzero(~weak)} others are known to {rest:.2g} px rms."
+        ]
+
     def __str__(self) -> str:
         n_exposures, count = (sum(getattr(each, name) for each in self.nights) for name in ("n_exposures", "n_nights"))
         of = f"{n_exposures} exposures of {count} night{'s' * (count > 1)}"
@@ -301,7 +314,7 @@ class CombinedNights(ShownAsPrinted):
                 lines.append(f"A coefficient changes by {drift}." if self.drifts else "No change with time is seen.")
         lines += [*self._said_of_odd(), ""]
         lines.append("Normalised Legendre modes, undistorted to detector pixels, shift, rotation and scale taken off:")
-        lines += self.modes().pformat(max_lines=-1, max_width=-1)
+        lines += [*self.modes().pformat(max_lines=-1, max_width=-1), *self._said_of_weak()]
         shown = self.table[[name for name in self.table.colnames if name != "odd"]]
         for name, form in (("date", ".3f"), ("departure", ".4f"), ("chi2", ".1f"), ("p", ".2g"), ("oddness", ".2f")):
             shown[name].info.format = form

@@ -259,7 +259,7 @@ def _model(nights, dates, degrees, drifts):
 
 
 def contradiction(chain, n, width):
-    """Whether a night contradicts all others: chi2, in how many directions, and the differences (K,) that are determined.
+    """Whether a night contradicts all others: chi2, in how many directions, and differences (K,) that are determined.
 
     `width` (K,) is the scatter of nights.
     """

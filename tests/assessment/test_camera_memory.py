@@ -279,6 +279,7 @@ def test_what_nights_of_one_orientation_do_not_determine_hides_no_odd_night(tmp_
     nights = [solved(600 + i, static(3) + curved(650 + i, 0.02), turns=(0,), year=2014 + i) for i in range(4)]
     combined = ld.combine_nights(nights[:3])
     assert np.sqrt(np.diag(combined.static()[1])).max() > 0.1
+    assert "4 combinations are known to" in str(combined)
     away = combined.table["departure"].value
     assert away.max() < 0.1  # not of the unknown ones
     assert ld.difference(combined, nights[3]).agrees
