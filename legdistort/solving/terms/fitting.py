@@ -28,9 +28,10 @@ from ..equations.star_terms import unpacked
 from .displaced import FITS, SMALL, Tabled, displaced, taken_off, unclipped
 from .field_of_one import FieldOfOne, fit_with_field_of_one
 from .observed import Observed
+from .random_field import Found
 from .term import FIELD_NUMBERS, RandomField
 from .turbulence import SHOWN as FIELD_SHOWN
-from .turbulence import fit_with_field
+from .turbulence import errors_of, field_of, fit_with_field, with_errors
 
 #: Twice the gain in the logarithm of the likelihood from which a term is there.
 SHOWN = 4.0
@@ -94,11 +95,48 @@ def fit_with(terms, tie, estimate, matches, options, *how):
     return fit, partial(numbers.found, step), rest
 
 
-def _fit_with_field(terms, tie, estimate, matches, options, *how):
-    """`fit_with` of a random field alone."""
+def forecast(terms, fit):
+    """A fit to positions without noise with the errors of terms whose sizes are stated, as `fit_with` states them.
+
+    Parameters
+    ----------
+    terms : sequence of Term or RandomField
+    fit : Fit
+
+    Returns
+    -------
+    Fit
+    ndarray or callable
+        Of new positions, as `legdistort.results.accuracy.expected_scatter` takes it.
+
+    Raises
+    ------
+    SolveError
+        For more numbers than can be found at once, and a random field beside other terms.
+    """
+    if any(isinstance(term, RandomField) for term in terms):
+        _check_alone(terms)
+        known = Found(terms[0].kernel, np.inf), True
+        field, _ = field_of(fit, np.zeros_like(fit.problem.xy), known)
+        errors = errors_of(fit, field)
+        return with_errors(fit, field, errors), errors
+    numbers = _Numbers.of(terms, fit, {})
+    made = _with_errors(fit, numbers.step(fit, np.zeros(len(numbers.keys))), numbers)
+    known, added = fit.uncertainty.coefficients, made.camera_errors.coefficients
+    if known.ndim == 2:
+        added = added.reshape(-1, added.shape[2])
+    return made, known + added @ added.mT
+
+
+def _check_alone(terms):
     if len(terms) > 1:
         others = " and ".join(term.name for term in terms if not isinstance(term, RandomField))
         raise SolveError(f"turbulence cannot be found beside other terms yet: leave out {others}, or turbulence")
+
+
+def _fit_with_field(terms, tie, estimate, matches, options, *how):
+    """`fit_with` of a random field alone."""
+    _check_alone(terms)
     if tie is not None and len(matches.names) == 1:
         fit, field, rest = fit_with_field_of_one(estimate, tie, matches, options, *how)
     else:
@@ -106,7 +144,7 @@ def _fit_with_field(terms, tie, estimate, matches, options, *how):
     numbers, shown, gain = FIELD_NUMBERS, np.zeros(len(FIELD_NUMBERS)), 0.0 if field is None else field.gain
     if field is not None and gain >= FIELD_SHOWN:
         kernel = field.kernel
-        shown = np.array([kernel.size, kernel.length, kernel.ratio, kernel.angle])
+        shown = np.array([kernel.size, kernel.length, kernel.smoothness, kernel.ratio, kernel.angle])
     if shown[0] and isinstance(field, FieldOfOne):
         numbers, shown = (*numbers, "factor on x errors", "factor on y errors"), np.append(shown, field.factors)
     found = FittedTerm(
