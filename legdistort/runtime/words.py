@@ -19,7 +19,7 @@ METHODS = ("joint", "alternating")
 GAUGES = ("minimal", "mean")
 LOSSES = ("linear", "huber", "cauchy")
 ERRORS = ("stated", "scale", "floor", "by-brightness", "correlated")
-MOTIONS = ("proper", "parallax", "auto")
+MOTIONS = ("proper", "parallax", "acceleration", "auto")
 TERMS = ("refraction", "pixel_phase", "acceleration", "orbits", "rough_static", "turbulence")
 #: Those that a forecast takes by their sizes.
 SIZED_TERMS = ("refraction", "pixel_phase", "turbulence")

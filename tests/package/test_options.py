@@ -229,6 +229,7 @@ SOLVE = [
     row(validate=0.2),
     row(motion="proper"),
     row(motion="parallax"),
+    row(motion="acceleration"),
     row(motion="auto"),
     row(motion="proper", motion_sigma="evidence"),
     row(motion="proper", motion_epoch=Time("2016-07-01")),

@@ -39,6 +39,8 @@ SHOWN = 4.0
 _FALSE, _SWEEPS = 0.05, 300
 #: Part of that gain which an owner must show by itself to be looked at beside all others.
 _PERHAPS = 0.3
+#: Part of what tells numbers below which it is rounding, once positions and motions of stars follow.
+_ROUNDING = 1e-9
 #: Size that stands for an infinite one, in errors of a number if all others were known.
 _FREE = 1e4
 #: Numbers of all terms together, at most, and values of their displacements.
@@ -411,13 +413,15 @@ def _asked(fit, term, owner, columns, known):
     pull = np.einsum("akn,an->kn", moved, blocks.residual)
     k = len(columns)
     normal = np.array([[np.bincount(owner, left[i, j], n) for j in range(k)] for i in range(k)]).transpose(2, 0, 1)
+    told = np.einsum("jaa->j", normal)
     if term.owner == "star":  # whose position and motion follow
         alone = np.array([[np.bincount(owner, row, n) for row in rows] for rows in at_star]).transpose(2, 0, 1)
         normal = normal - alone.mT @ unpacked(inverse_star_blocks(blocks.v)) @ alone
     pull = np.array([np.bincount(owner, row, n) for row in pull]).T + np.einsum("jab,jb->ja", normal, known)
     unit = 1 / np.sqrt(np.maximum(np.median(np.einsum("jaa->ja", normal), axis=1), 1e-300))
     gains = np.array([_best_size(*each, np.nan)[1] for each in zip(normal, pull, unit, strict=True)])
-    return np.flatnonzero((gains > _PERHAPS * (SHOWN + 2 * np.log(n / _FALSE))) | known.any(axis=1))
+    told = np.einsum("jaa->j", normal) > _ROUNDING * told  # with few epochs positions and motions take all of it
+    return np.flatnonzero(told & (gains > _PERHAPS * (SHOWN + 2 * np.log(n / _FALSE))) | known.any(axis=1))
 
 
 def _owners(term, observed):

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 #: Whose numbers they are: one set of them for all observations, or one for each of these.
 OWNERS = ("set", "exposure", "detector", "star")
 _COLOUR, _ZENITH = "colour", ("tan_z", "parallactic_angle")
+_ACCELERATION = "acceleration"
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,6 +278,16 @@ def listed(given: Any) -> list[Term | RandomField]:
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"the term {twice[0]!r} is given twice")
     return made
+
+
+def of_motion(
+    motion: str | None, given: str | Term | RandomField | Iterable[str | Term | RandomField] | None
+) -> tuple[str | None, Any]:
+    """The motion and the terms that are asked for: "acceleration" is "proper" with the term of that name."""
+    if motion != _ACCELERATION:
+        return motion, given
+    made = listed(given)
+    return "proper", made + [Term.named(_ACCELERATION)] * all(term.name != _ACCELERATION for term in made)
 
 
 def terms_of(
