@@ -49,6 +49,24 @@ def pairs(text):
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=NUMBER,...") from None
 
 
+def sized_terms(choices):
+    """Parser of terms with their sizes, ``NAME=SIZE[:SIZE...],...``, as ``[(name, sizes)]``."""
+
+    def parse(text):
+        made = []
+        for each in text.split(","):
+            name, _, sizes = each.partition("=")
+            try:
+                made.append((name, [float(size) for size in sizes.split(":")]))
+            except ValueError:
+                raise argparse.ArgumentTypeError(f"{each!r} is not of the form NAME=SIZE") from None
+            if name not in choices:
+                raise argparse.ArgumentTypeError(f"{name!r} is none of {', '.join(choices)}")
+        return made
+
+    return parse
+
+
 def spectrum(text):
     """``degree=rms,...`` as a dict."""
     try:

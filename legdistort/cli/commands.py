@@ -28,7 +28,7 @@ from ..solving.choices.degree_choice import AUTO, HIGHEST
 from ..solving.options import DEGREE
 from . import options
 from .arguments import flagged, given, lines_of_images, wants_progress
-from .given_files import given_camera, known_file, read_given, read_matches, refuse
+from .given_files import given_camera, known_file, read_given, read_matches, refuse, sized_term
 from .repeating import repeatable
 
 #: What belongs to a reference.
@@ -308,7 +308,7 @@ def do_predict(a):
         refuse({"shape": a.shape}, "comes from --camera")
     if a.shape is not None:
         keywords["shape"] = tuple(a.shape)
-    keywords["camera"] = given_camera(a.camera)
+    keywords |= {"camera": given_camera(a.camera), "terms": [sized_term(*each) for each in a.term or ()]}
     prediction = legdistort.predict(**keywords)
     _draw(prediction, a)
     plans = prediction.alternatives()

@@ -1,4 +1,4 @@
-"""Files that are given on the command line: tables, cameras, matched positions of one field or several."""
+"""What is given on the command line: tables, cameras, matched positions of one field or several, sized terms."""
 
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -17,6 +17,14 @@ def refuse(given, reason):
     for name, value in given.items():
         if value not in (None, False):
             raise InputError(f"--{name.replace('_', '-')} {reason}: leave it out")
+
+
+def sized_term(name, sizes):
+    """A `legdistort.Term` of a forecast by its sizes, in order."""
+    names = ("size", "length", "smoothness", "ratio", "angle") if name == "turbulence" else ("sigma",)
+    if len(sizes) > len(names):
+        raise InputError(f"--term {name} has {len(sizes)} sizes: it takes {', '.join(names)}")
+    return legdistort.Term.named(name, **dict(zip(names, sizes, strict=False)))
 
 
 def read_given(path, a, contract=None):

@@ -13,6 +13,7 @@ from .arguments import (
     number_or_name,
     pairs,
     planes,
+    sized_terms,
     some_words,
     spectrum,
     word_or,
@@ -402,5 +403,15 @@ PREDICTING = {
     "pixel_scale": Option(
         "the errors in mas; lengths may then be angles: --sigma 0.4mas", type=float, metavar="ARCSEC"
     ),
+    "terms": Option(
+        f"what displaces stars and will be found too, and its size: {', '.join(words.SIZED_TERMS)}=SIZE:LENGTH"
+        "[:SMOOTHNESS[:RATIO:ANGLE]]",
+        "--term",
+        type=sized_terms(words.SIZED_TERMS),
+        action="extend",
+        metavar="NAME=SIZE,...",
+    ),
+    "tan_z": Option("of the zenith distances of the exposures", type=float, nargs="+", metavar="TAN"),
+    "parallactic_angle": Option("of the exposures, degrees", type=float, nargs="+", metavar="DEG"),
     "seed": Option("of stars and shifts that are drawn (default 0)", type=int),
 }

@@ -17,6 +17,8 @@ from .estimate import StoredUncertainty
 
 #: Numbers held at once while expected scatters are computed.
 _BLOCK = 2**24
+#: Positions of which the responses to all errors are made at once.
+_AT_ONCE = 500
 
 
 def total(per_axis):
@@ -389,8 +391,11 @@ def expected_scatter(solution, xy, sigma, *, seen=None, covariance=None):
         Error of one detector position, pixels per axis.
     seen : array_like of bool, shape (n_exposures, n), optional
         In which exposures a position is measured; by default those on whose detector it falls.
-    covariance : ndarray, shape (n_exposures * 2 n_modes,) squared or (n_exposures, 2 n_modes, 2 n_modes), optional
-        Of the errors of the coefficients, of this or a higher degree; by default that of the solution.
+    covariance : ndarray or callable, optional
+        Of the errors of the coefficients, of this or a higher degree, shape (n_exposures * 2 n_modes,) squared or
+        (n_exposures, 2 n_modes, 2 n_modes); by default that of the solution. Or, with ``covariance(i, q)``, of what is
+        measured in exposure i at undistorted pixels q (k, 2): covariance (k, 2, 2) of what is its alone, and responses
+        (k, 2, r) to independent errors of unit size that all exposures share.
 
     Returns
     -------
@@ -400,7 +405,10 @@ def expected_scatter(solution, xy, sigma, *, seen=None, covariance=None):
     xy = np.asarray(xy, dtype=float)
     covariance = solution.estimate.uncertainty.coefficients if covariance is None else covariance
     sigma = np.broadcast_to(sigma, (len(solution.names), len(xy)))
-    step = max(1, _BLOCK // (2 * len(covariance) * (1 if covariance.ndim == 2 else covariance.shape[1])))
+    if callable(covariance):
+        step = _AT_ONCE
+    else:
+        step = max(1, _BLOCK // (2 * len(covariance) * (1 if covariance.ndim == 2 else covariance.shape[1])))
     parts = [
         _expected_variance(
             solution, xy[part], sigma[:, part], None if seen is None else np.asarray(seen)[:, part], covariance
@@ -412,12 +420,7 @@ def expected_scatter(solution, xy, sigma, *, seen=None, covariance=None):
 
 def _expected_variance(solution, xy, sigma, seen, covariance):
     """Square of `expected_scatter` for as many positions as fit in memory."""
-    n_exposures = len(solution.names)
-    blocks = exposure_blocks(covariance, n_exposures)
-    size = blocks.shape[1]
-    degree = basis.degree_of(size // 2)
-    rows = np.zeros((n_exposures, len(xy), 2, size))
-    own, noise, n = np.zeros(len(xy)), np.zeros(len(xy)), np.zeros(len(xy), dtype=int)
+    places, noise, n = [], np.zeros(len(xy)), np.zeros(len(xy), dtype=int)
     for i, name in enumerate(solution.names):
         distortion, pose = solution[name].distortion, solution.poses[name]
         ny, nx = solution.estimate.shapes[name]
@@ -427,13 +430,40 @@ def _expected_variance(solution, xy, sigma, seen, covariance):
         else:
             on = seen[i]
         back = np.linalg.inv(distortion.jacobian(q[on]) @ pose[:, :2])
-        b = basis.values(degree, *basis.normalize(q[on], solution.estimate.shapes[name]))
-        rows[i, on] = mine = np.einsum("kac,mk->kacm", back, b).reshape(len(b.T), 2, size)
-        own[on] += (mine @ blocks[i] * mine).sum(axis=(1, 2))
+        places.append((on, q[on], back))
         noise[on] += sigma[i, on] ** 2 * (back**2).sum(axis=(1, 2))
         n[on] += 1
-    flat = rows.transpose(1, 2, 0, 3).reshape(2 * len(xy), -1)
-    together = (times(covariance, flat.T).T * flat).sum(axis=1).reshape(-1, 2).sum(axis=1)
+    by = _by_responses if callable(covariance) else _by_coefficients
+    own, together = by(solution, places, covariance, len(xy))
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = (own + noise - (together + noise) / n) / (2 * n)
     return np.where(n > 1, np.maximum(variance, 0), np.nan)
+
+
+def _by_coefficients(solution, places, covariance, n):
+    """Variance (n,) of n positions by errors of coefficients, summed over exposures, and that of their sum."""
+    blocks = exposure_blocks(covariance, len(places))
+    size = blocks.shape[1]
+    degree = basis.degree_of(size // 2)
+    rows, own = np.zeros((len(places), n, 2, size)), np.zeros(n)
+    for i, ((on, q, back), name) in enumerate(zip(places, solution.names, strict=True)):
+        b = basis.values(degree, *basis.normalize(q, solution.estimate.shapes[name]))
+        rows[i, on] = mine = np.einsum("kac,mk->kacm", back, b).reshape(len(b.T), 2, size)
+        own[on] += (mine @ blocks[i] * mine).sum(axis=(1, 2))
+    flat = rows.transpose(1, 2, 0, 3).reshape(2 * n, -1)
+    return own, (times(covariance, flat.T).T * flat).sum(axis=1).reshape(-1, 2).sum(axis=1)
+
+
+def _by_responses(_, places, errors, n):
+    """The same by what ``errors(i, q)`` gives of what is measured."""
+    alone, own, shared = np.zeros(n), np.zeros(n), None
+    for i, (on, q, back) in enumerate(places):
+        if not len(q):
+            continue
+        covariance, moved = errors(i, q)
+        moved = back @ moved
+        shared = np.zeros((n, *moved.shape[1:])) if shared is None else shared
+        shared[on] += moved
+        alone[on] += np.einsum("kab,kbc,kac->k", back, covariance, back)
+        own[on] += (moved**2).sum(axis=(1, 2))
+    return own + alone, alone + (0 if shared is None else (shared**2).sum(axis=(1, 2)))

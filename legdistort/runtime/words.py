@@ -19,8 +19,10 @@ METHODS = ("joint", "alternating")
 GAUGES = ("minimal", "mean")
 LOSSES = ("linear", "huber", "cauchy")
 ERRORS = ("stated", "scale", "floor", "by-brightness", "correlated")
-MOTIONS = ("proper", "parallax", "auto")
+MOTIONS = ("proper", "parallax", "acceleration", "auto")
 TERMS = ("refraction", "pixel_phase", "acceleration", "orbits", "rough_static", "turbulence")
+#: Those that a forecast takes by their sizes.
+SIZED_TERMS = ("refraction", "pixel_phase", "turbulence")
 #: What is done about layouts and static distortions of a camera; without one a static distortion can only be fitted.
 CAMERA = ("hold", "prior", "fit")
 #: What of a camera has a distortion of its own in every exposure.

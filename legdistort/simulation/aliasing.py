@@ -84,8 +84,15 @@ def assumed_spectra(plan):
             "the widths of the prior state the scatter of the modes that are fitted: leave dynamic out, and let "
             f"spectrum begin at degree {degree + 1}"
         )
-    common = 0.0 if plan.static_spectrum is None else plan.static_spectrum
-    return independent, spectrum_of(common, degree, "static_spectrum")
+    common = spectrum_of(0.0 if plan.static_spectrum is None else plan.static_spectrum, degree, "static_spectrum")
+    if plan.terms:
+        if any(np.nan_to_num(each[:, n_fit:]).any() for each in (independent, common)):
+            raise InputError(
+                "beside terms nothing is foreseen of degrees beyond the fitted one: cut the spectrum at degree "
+                f"{degree}, or leave terms out; turbulence states what is beyond the fit"
+            )
+        independent, common = independent[:, :n_fit], common[:, :n_fit]
+    return independent, common
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,11 @@ from ..solving.equations.covariances import Uncertainty
 from ..solving.equations.problem import State
 from ..solving.gauge import constraints
 from ..solving.gauge.hierarchy import named
+from ..solving.minimisers import Result
+from ..solving.single_fit import Fit
+from ..solving.terms.fitting import forecast
+from ..solving.terms.term import RandomField
+from ..solving.terms.turbulence import coefficient_scatter
 
 #: Without an assumption the scatter of single exposures is taken to be this many times the errors.
 _LARGE = 100.0
@@ -37,17 +42,28 @@ def noiseless_solution(matches, problem, layout, scatter):
     State
     Uncertainty
         With the plane held by the convention of the gauge, whatever else determines it.
+    errors : ndarray, callable or None
+        Of new positions, see `legdistort.solving.terms.fitting.forecast`; None without terms.
     """
     positions = layout.positions[np.asarray(matches.stars)]
     stars = np.concatenate([positions.T, np.zeros((problem.terms.n, len(positions)))])
     state = State(stars, problem.prior_mean.copy(), np.stack(list(layout.poses.values())))
     blocks = criterion.linearise(problem, state)
+    for term in layout.terms:
+        if isinstance(term, RandomField):
+            own = coefficient_scatter(term.kernel, problem, blocks, state)
+            scatter = np.hypot(own, 0.0 if scatter is None else scatter)
     gauge = _gauge(problem, state, blocks, scatter, layout.sigma)
+    exact, fit, errors = replace(blocks, residual=np.zeros_like(blocks.residual), chi2=0.0), None, None
     uncertainty = held = Uncertainty(problem, blocks, gauge)
+    if layout.terms:
+        n = len(matches.table)
+        result = Result(state, exact, gauge, True, "", 0, np.ones(n))
+        fit, errors = forecast(layout.terms, Fit(matches, problem, result, np.ones(n, dtype=bool), None))
+        uncertainty = held = fit.uncertainty
     if gauge.static in ("none", "fitted", "uncertain"):
-        plain = replace(problem, mean_sigma=None)
-        held = Uncertainty(problem, blocks, _gauge(plain, state, blocks, scatter, layout.sigma))
-    exact = replace(blocks, residual=np.zeros_like(blocks.residual), chi2=0.0)
+        plain = _gauge(replace(problem, mean_sigma=None), state, blocks, scatter, layout.sigma)
+        held = Uncertainty(problem, blocks, plain, camera=uncertainty.camera)
     solution = assemble(
         matches,
         problem,
@@ -59,7 +75,9 @@ def noiseless_solution(matches, problem, layout, scatter):
         status="predicted: nothing was measured",
         dof=0,
     )
-    return solution, state, held
+    if fit is not None and fit.tabled is not None:
+        solution = fit.tabled.into(solution, 1.0)
+    return solution, state, held, errors
 
 
 def _gauge(problem, state, blocks, scatter, sigma):

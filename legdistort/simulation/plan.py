@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import Any
 
@@ -19,7 +19,11 @@ from ..inputs import column_contract
 from ..priors.prior import Prior
 from ..runtime.checks import check_counts, check_positive
 from ..solving.equations.problem import as_given
+from ..solving.terms.term import RandomField, Term, listed
 from . import observations, truth
+
+#: What is stated of the exposures for terms.
+OF_EXPOSURES = "tan_z", "parallactic_angle"
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -52,11 +56,16 @@ class Plan:
     field: SkyCoord | None = None
     camera: Camera | None = None
     pixel_scale: float | None = None
+    terms: tuple[Term | RandomField, ...] = ()
+    tan_z: Any = None
+    parallactic_angle: Any = None
 
     def __post_init__(self) -> None:
         for name, value in zip(("shape", "prior"), self._field(), strict=True):
             object.__setattr__(self, name, value)
         self._check_epochs()
+        object.__setattr__(self, "terms", tuple(_sized(term) for term in listed(self.terms)))
+        self._check_terms()
         check_counts(n_grid=self.n_grid, n_exposures=self.n_exposures)
         object.__setattr__(self, "degree", basis.check_degree(self.degree))
         if self.pixel_scale is not None:
@@ -123,6 +132,35 @@ class Plan:
         return TangentPlane(place.ra.deg, place.dec.deg, matrix)
 
     @property
+    def has_fields(self) -> bool:
+        """Whether every exposure has a random field."""
+        return any(isinstance(term, RandomField) for term in self.terms)
+
+    def columns(self, n: int) -> dict[str, np.ndarray]:
+        """Columns that terms need, of n stars in every exposure: ``{name: (n_exposures, n)}``."""
+        stars, made = self.stars if isinstance(self.stars, Table) else Table(), {}
+        for name in dict.fromkeys(name for term in self.terms for name in getattr(term, "needs", ())):
+            found = column_contract.colour_column(stars) if name == "colour" else name
+            if name in OF_EXPOSURES and getattr(self, name) is not None:
+                made[name] = np.asarray(getattr(self, name), dtype=float)[:, None]
+            elif found in stars.colnames:
+                made[found] = stars[found]
+        return {name: np.broadcast_to(values, (self.n_exposures, n)) for name, values in made.items()}
+
+    def _check_terms(self):
+        """Terms that are of detectors, and what is stated of the exposures for others."""
+        if self.has_focal_plane and (own := [term.name for term in self.terms if term.owner == "detector"]):
+            raise InputError(f"term {own[0]} is of every detector: leave the camera out, and give the shape of one")
+        for name in OF_EXPOSURES:
+            if (given := getattr(self, name)) is None:
+                continue
+            if not any(name in getattr(term, "needs", ()) for term in self.terms):
+                raise InputError(f"{name} is for terms that need it, such as refraction: give terms, or leave it out")
+            values = np.asarray(given, dtype=float)
+            if values.shape != (self.n_exposures,) or not np.isfinite(values).all():
+                raise InputError(f"{name} must be a number for each of the {self.n_exposures} exposures, got {given!r}")
+
+    @property
     def least(self) -> int:
         """Exposures that a star must be on: four, or all if there are fewer, unless `min_exposures` is given."""
         return min(4, self.n_exposures) if self.min_exposures is None else self.min_exposures
@@ -149,6 +187,9 @@ class Layout:
         Standard deviations, pixels.
     years : ndarray, shape (n_exposures,), or None
     sky : TangentPlane or None
+    columns : dict
+        ``{name: (n_exposures, n_all)}`` that terms need.
+    terms : tuple of Term or RandomField
     """
 
     positions: np.ndarray
@@ -158,6 +199,8 @@ class Layout:
     errors: np.ndarray
     years: np.ndarray | None = None
     sky: TangentPlane | None = None
+    columns: dict = field(default_factory=dict)
+    terms: tuple = ()
 
     @property
     def sigma(self):
@@ -172,7 +215,18 @@ class Layout:
             names, self.shape, self.positions, None, static, zero, self.poses, self.poses, years=self.years
         )
         rng = np.random.default_rng(0)
-        return observations.matches_from(plan, self.observed, self.errors, rng, noise=0, sky=self.sky)
+        matches = observations.matches_from(plan, self.observed, self.errors, rng, noise=0, sky=self.sky)
+        table, at = matches.table.copy(copy_data=False), {name: i for i, name in enumerate(names)}
+        exposure, star = [at[str(name)] for name in table["exposure"]], np.asarray(table["star"])
+        for name, values in self.columns.items():
+            table[name] = values[exposure, star]
+        for term in self.terms:
+            if isinstance(term, Term) and (lacking := term.lacking(table)):
+                raise InputError(
+                    f"term {term.name} needs {', '.join(lacking)}: give stars as a table with such columns, and "
+                    f"{' and '.join(OF_EXPOSURES)} of the exposures (--tan-z, --parallactic-angle)"
+                )
+        return replace(matches, table=table)
 
     def axes(self, n):
         """Coordinates x, y of a grid of the field, n points along its longer side, as centres of cells."""
@@ -220,7 +274,32 @@ def lay_out(plan):
     if plan.has_focal_plane:
         planes = [similarity.apply(pose, positions) for pose in pose_list.values()]
         errors = np.array([plan.camera.errors_in_focal_plane(f, e) for f, e in zip(planes, errors, strict=True)])
-    return Layout(positions, pose_list, shape, observed, errors, years, plan.sky)
+    columns = plan.columns(len(positions))
+    return Layout(positions, pose_list, shape, observed, errors, years, plan.sky, columns, plan.terms)
+
+
+def _sized(term):
+    """A term whose sizes are stated, and which a forecast can have."""
+    if isinstance(term, RandomField):
+        if term.size is None:
+            raise InputError(
+                f"a forecast finds no sizes: give {term.name} its own, "
+                f"Term.named({term.name!r}, size=0.1, length=200) [pix] (--term {term.name}=0.1:200)"
+            )
+        return term
+    if hasattr(term.columns, "basis"):
+        raise InputError(f"a forecast has no distortion that is rougher than the series: leave {term.name} out")
+    if term.each:
+        raise InputError(
+            f"which stars have the term {term.name} is not known before they are seen: leave it out, or let all have "
+            f"it, of a stated size (Term.named({term.name!r}, each=False, sigma=...))"
+        )
+    if term.sigma is None:
+        raise InputError(
+            f"a forecast finds no sizes: give {term.name} its own, Term.named({term.name!r}, sigma=0.03) "
+            f"[{term.unit}] (--term {term.name}=0.03)"
+        )
+    return term
 
 
 def _poses(plan, rng):

@@ -6,7 +6,7 @@ no simulation (Bernard et al. 2017, section 4, measures the same by Monte Carlo)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from ..cameras.camera import Camera
     from ..priors.prior import Prior
     from ..runtime.annotations import Shape
+    from ..solving.terms.term import RandomField, Term
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +205,7 @@ class Prediction(ShownAsPrinted):
         if (
             settings.poses is None
             and settings.epochs is None
+            and settings.tan_z is None
             and np.ndim(settings.dithers) == 0
             and np.ndim(settings.sigma) < 2
         ):
@@ -255,6 +257,9 @@ def predict(
     epochs: ArrayLike | None = None,
     field: SkyCoord | None = None,
     pixel_scale: float | None = None,
+    terms: Term | RandomField | Iterable[Term | RandomField] = (),
+    tan_z: ArrayLike | None = None,
+    parallactic_angle: ArrayLike | None = None,
     n_grid: int = 50,
     seed: int = 0,
 ) -> Prediction:
@@ -306,6 +311,13 @@ def predict(
     pixel_scale : float, optional
         Arcsec: lengths may be given as angles then (``0.4 * u.mas``), and the printed errors are angles. Attributes and
         maps stay in pixels.
+    terms : Term, or a list of them, optional
+        What displaces stars beside the distortion and will be found with it, as `legdistort.solve` takes them, but with
+        their sizes: ``Term.named("pixel_phase", sigma=0.03)``, ``Term.named("turbulence", size=0.1, length=200)``.
+        Turbulence stands in the place of `dynamic` where that is not given: the mean distortion of the exposures then
+        is as large as such fields make it. Columns that a term needs (`Term.needs`) are those of `stars`.
+    tan_z, parallactic_angle : array_like, shape (n_exposures,), optional
+        Tangent of the zenith distance, and degrees, of the exposures, which "refraction" needs.
     n_grid : int
         Points of the maps along the longer side.
     seed : int
@@ -320,7 +332,7 @@ def predict(
     InputError
         For arguments out of range or in contradiction.
     SolveError
-        Naming the exposure with fewer stars than modes, as `solve` would.
+        Naming the exposure with fewer stars than modes, as `solve` would; for terms of more numbers than can be found.
 
     See Also
     --------
@@ -343,7 +355,8 @@ def predict(
         n_exposures=n_exposures, stars=stars, n_stars=n_stars, density=density, sigma=sigma, degree=degree,
         shape=shape, dithers=dithers, poses=poses, prior=prior, dynamic=dynamic, spectrum=spectrum,
         static_spectrum=static_spectrum, min_exposures=min_exposures, n_grid=n_grid, seed=seed,
-        epochs=epochs, field=field, camera=camera, pixel_scale=pixel_scale,
+        epochs=epochs, field=field, camera=camera, pixel_scale=pixel_scale, terms=terms, tan_z=tan_z,
+        parallactic_angle=parallactic_angle,
     )  # fmt: skip
     return _predict(plan)
 
@@ -361,10 +374,11 @@ def _predict(plan):
     problem = build_problem(matches, plan.degree, prior=plan.prior, motion=motion)
     fitted = independent[:, : problem.n_modes]
     known = bool(np.isfinite(fitted).all())
-    solution, state, held = noiseless_solution(matches, problem, layout, fitted if known else None)
+    solution, state, held, errors = noiseless_solution(matches, problem, layout, fitted if known else None)
+    known |= plan.has_fields
     x, y = layout.axes(plan.n_grid)
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    noise = accuracy.expected_scatter(solution, grid, layout.sigma)
+    noise = accuracy.expected_scatter(solution, grid, layout.sigma, covariance=errors)
     aliased, folded, b_alias = np.where(np.isfinite(noise), 0.0, np.nan), np.zeros_like(fitted), 0.0
     if max(independent.shape[1], common.shape[1]) > problem.n_modes:
         aliasing = alias(

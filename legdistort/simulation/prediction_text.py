@@ -59,6 +59,7 @@ def describe(prediction):
             row("sigma, new positions inside the contour", *sigma, prediction.s_sigma, thumb_sigma),
             row("sigma, new positions over the whole field", prediction.sigma_field, finite_rms(prediction.alias_map)),
             *(row(_MOTIONS[name].format(unit), error) for name, error in prediction.motion_errors.items()),
+            *(f"found beside, of the size that is stated: {term!r}" for term in prediction.settings.terms),
             *textwrap.wrap(f"All but b, absolute, are relative: {_relative(prediction)}", 110),
             f"gauge {solution.gauge.kind}; thumb: s_b = 1/sqrt(n_im), s_sigma = sqrt((1 - 1/n_im)(1 + n_modes/n_star))",
         ]

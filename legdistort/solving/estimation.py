@@ -35,7 +35,7 @@ from .residual_errors.by_brightness import estimate_by_brightness
 from .residual_errors.correlated import estimate_with_correlations
 from .single_detectors import by_detector
 from .terms.fitting import fit_with
-from .terms.term import terms_of
+from .terms.term import of_motion, terms_of
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -155,9 +155,10 @@ def solve(
     validate : float, optional
         Keep this fraction of the stars, 0 to 0.5, out of the fit, and report their scatter beside the one to be
         expected: ``diagnostics.validation``. They are not in the tables of the solution.
-    motion : {None, "proper", "parallax", "auto"}
+    motion : {None, "proper", "parallax", "acceleration", "auto"}
         Fit a proper motion of every star beside its position, a parallax too, or decide by the evidence of the set
-        whether stars move. The times of the exposures are those of their headers or of the column ``epoch``.
+        whether stars move. "acceleration" is "proper" with the term of that name beside those of `terms`. The times of
+        the exposures are those of their headers or of the column ``epoch``.
     motion_sigma : float or "evidence", optional
         Scatter of the proper motions of stars around their mean, per axis, pixels a year: known, or found from the set.
         None: nothing is known of them.
@@ -232,6 +233,7 @@ def solve(
     >>> [check.name for check in solution.checks if check.state == "fail"]
     []
     """
+    motion, terms = of_motion(motion, terms)
     matches = with_stated(matches, pose_sigma, layout, layout_sigma)
     matches, prior, static = _of_detectors(matches, prior, layout, static, dynamic)
     sought, prior = _of_camera(matches, prior, model, degree, layout, static, exposure_degree)

@@ -40,6 +40,7 @@ from legdistort.results.view import View
 from legdistort.simulation.observations import simulate_matches
 from legdistort.simulation.prediction import predict
 from legdistort.solving.estimation import solve
+from legdistort.solving.terms.term import Term
 from legdistort.wcs.attachment import attach
 from legdistort.wcs.refinement import refine
 
@@ -228,6 +229,7 @@ SOLVE = [
     row(validate=0.2),
     row(motion="proper"),
     row(motion="parallax"),
+    row(motion="acceleration"),
     row(motion="auto"),
     row(motion="proper", motion_sigma="evidence"),
     row(motion="proper", motion_epoch=Time("2016-07-01")),
@@ -387,6 +389,7 @@ REPORT = [
     row(exposures=frames),
 ]
 STARS = np.random.default_rng(3).uniform([0, 0], [120, 80], (40, 2))
+COLOURED = Table({"x": STARS[:, 0], "y": STARS[:, 1], "colour": np.linspace(-1, 2, 40)})
 PREDICT = [
     row(stars=STARS),
     row(n_stars=40, min_exposures=3, seed=2),
@@ -403,6 +406,15 @@ PREDICT = [
     row(epochs=[2015.0, 2016.0, 2017.0, 2018.0]),
     row(epochs=[2015.0, 2016.0, 2017.0, 2018.0], field=SkyCoord(10.0, -70.0, unit="deg")),
     row(n_exposures=3, n_grid=8),
+    row(terms=Term.named("turbulence", size=0.1, length=40)),
+    row(terms=[Term.named("pixel_phase", sigma=0.03)]),
+    row(terms="turbulence", refused={"": "a forecast finds no sizes: give turbulence its own"}),
+    row(
+        terms=Term.named("refraction", sigma=0.02),
+        stars=COLOURED,
+        tan_z=[0.3, 0.4, 0.5, 0.6],
+        parallactic_angle=[0, 20, 40, 60] * u.deg,
+    ),
 ]
 MATCH = [
     row(exposures=frames, camera=None),

@@ -245,6 +245,25 @@ def test_errors_are_calibrated(bent, terms):
     assert np.all(there == 1) if bent else np.all(there <= 0.1)
 
 
+def test_accelerations_in_one_word():
+    """The same as motions and the term, beside other terms too."""
+    bent = sky(11, acceleration=0.02, n_stars=30, n_exposures=12, years=15.0)
+    word, both = bent.solve(motion="acceleration"), bent.solve(motion="proper", terms="acceleration")
+    assert len(word.terms) >= 2
+    for name in ("x", "y", "x_err", "x_err_abs", "vx", "vx_err"):
+        assert_allclose(word.stars[name], both.stars[name], rtol=0, atol=0)
+    assert word.chi2 == both.chi2
+    assert str(word.settings) == str(both.settings)
+    for terms, expected in (
+        ("pixel_phase", ("pixel_phase", "acceleration")),
+        ([ld.Term.named("acceleration", sigma=0.02)], ("acceleration",)),
+    ):
+        solution = bent.solve(motion="acceleration", terms=terms)
+        assert (solution.settings.motion, solution.settings.terms) == ("proper", expected)
+    with pytest.raises(InputError, match="'proper', 'parallax', 'acceleration', 'auto', got"):
+        bent.solve(motion="accelerations")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("bent", [{"acceleration": 0.01}, {"orbits": 3.0}])
 def test_orbits_are_calibrated(bent):

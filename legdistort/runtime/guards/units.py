@@ -33,6 +33,7 @@ UNITS = {
     "read_noise": (u.electron,),
     "exposure_time": (u.s,),
     "rotations": (u.deg,),
+    "parallactic_angle": (u.deg,),
     "pixel_scale": (u.arcsec, u.arcsec / u.pix),
     "zero_point": (u.mag,),
 }

@@ -28,9 +28,10 @@ from ..equations.star_terms import unpacked
 from .displaced import FITS, SMALL, Tabled, displaced, taken_off, unclipped
 from .field_of_one import FieldOfOne, fit_with_field_of_one
 from .observed import Observed
+from .random_field import Found
 from .term import FIELD_NUMBERS, RandomField
 from .turbulence import SHOWN as FIELD_SHOWN
-from .turbulence import fit_with_field
+from .turbulence import errors_of, field_of, fit_with_field, with_errors
 
 #: Twice the gain in the logarithm of the likelihood from which a term is there.
 SHOWN = 4.0
@@ -38,6 +39,8 @@ SHOWN = 4.0
 _FALSE, _SWEEPS = 0.05, 300
 #: Part of that gain which an owner must show by itself to be looked at beside all others.
 _PERHAPS = 0.3
+#: Part of what tells numbers below which it is rounding, once positions and motions of stars follow.
+_ROUNDING = 1e-9
 #: Size that stands for an infinite one, in errors of a number if all others were known.
 _FREE = 1e4
 #: Numbers of all terms together, at most, and values of their displacements.
@@ -94,11 +97,48 @@ def fit_with(terms, tie, estimate, matches, options, *how):
     return fit, partial(numbers.found, step), rest
 
 
-def _fit_with_field(terms, tie, estimate, matches, options, *how):
-    """`fit_with` of a random field alone."""
+def forecast(terms, fit):
+    """A fit to positions without noise with the errors of terms whose sizes are stated, as `fit_with` states them.
+
+    Parameters
+    ----------
+    terms : sequence of Term or RandomField
+    fit : Fit
+
+    Returns
+    -------
+    Fit
+    ndarray or callable
+        Of new positions, as `legdistort.results.accuracy.expected_scatter` takes it.
+
+    Raises
+    ------
+    SolveError
+        For more numbers than can be found at once, and a random field beside other terms.
+    """
+    if any(isinstance(term, RandomField) for term in terms):
+        _check_alone(terms)
+        known = Found(terms[0].kernel, np.inf), True
+        field, _ = field_of(fit, np.zeros_like(fit.problem.xy), known)
+        errors = errors_of(fit, field)
+        return with_errors(fit, field, errors), errors
+    numbers = _Numbers.of(terms, fit, {})
+    made = _with_errors(fit, numbers.step(fit, np.zeros(len(numbers.keys))), numbers)
+    known, added = fit.uncertainty.coefficients, made.camera_errors.coefficients
+    if known.ndim == 2:
+        added = added.reshape(-1, added.shape[2])
+    return made, known + added @ added.mT
+
+
+def _check_alone(terms):
     if len(terms) > 1:
         others = " and ".join(term.name for term in terms if not isinstance(term, RandomField))
         raise SolveError(f"turbulence cannot be found beside other terms yet: leave out {others}, or turbulence")
+
+
+def _fit_with_field(terms, tie, estimate, matches, options, *how):
+    """`fit_with` of a random field alone."""
+    _check_alone(terms)
     if tie is not None and len(matches.names) == 1:
         fit, field, rest = fit_with_field_of_one(estimate, tie, matches, options, *how)
     else:
@@ -106,7 +146,7 @@ def _fit_with_field(terms, tie, estimate, matches, options, *how):
     numbers, shown, gain = FIELD_NUMBERS, np.zeros(len(FIELD_NUMBERS)), 0.0 if field is None else field.gain
     if field is not None and gain >= FIELD_SHOWN:
         kernel = field.kernel
-        shown = np.array([kernel.size, kernel.length, kernel.ratio, kernel.angle])
+        shown = np.array([kernel.size, kernel.length, kernel.smoothness, kernel.ratio, kernel.angle])
     if shown[0] and isinstance(field, FieldOfOne):
         numbers, shown = (*numbers, "factor on x errors", "factor on y errors"), np.append(shown, field.factors)
     found = FittedTerm(
@@ -373,13 +413,15 @@ def _asked(fit, term, owner, columns, known):
     pull = np.einsum("akn,an->kn", moved, blocks.residual)
     k = len(columns)
     normal = np.array([[np.bincount(owner, left[i, j], n) for j in range(k)] for i in range(k)]).transpose(2, 0, 1)
+    told = np.einsum("jaa->j", normal)
     if term.owner == "star":  # whose position and motion follow
         alone = np.array([[np.bincount(owner, row, n) for row in rows] for rows in at_star]).transpose(2, 0, 1)
         normal = normal - alone.mT @ unpacked(inverse_star_blocks(blocks.v)) @ alone
     pull = np.array([np.bincount(owner, row, n) for row in pull]).T + np.einsum("jab,jb->ja", normal, known)
     unit = 1 / np.sqrt(np.maximum(np.median(np.einsum("jaa->ja", normal), axis=1), 1e-300))
     gains = np.array([_best_size(*each, np.nan)[1] for each in zip(normal, pull, unit, strict=True)])
-    return np.flatnonzero((gains > _PERHAPS * (SHOWN + 2 * np.log(n / _FALSE))) | known.any(axis=1))
+    told = np.einsum("jaa->j", normal) > _ROUNDING * told  # with few epochs positions and motions take all of it
+    return np.flatnonzero(told & (gains > _PERHAPS * (SHOWN + 2 * np.log(n / _FALSE))) | known.any(axis=1))
 
 
 def _owners(term, observed):

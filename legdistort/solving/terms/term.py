@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +12,9 @@ import numpy as np
 from ...exceptions import InputError
 from ...inputs.column_contract import colour_column
 from ...results.motions import PATHS
-from ...runtime.checks import check_choice
+from ...runtime.checks import check_choice, check_positive
 from .displacements import PIXEL_WAVES, accelerations, orbits, pixel_waves, refraction
+from .random_field import Kernel
 from .rough import RoughColumns, names
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 #: Whose numbers they are: one set of them for all observations, or one for each of these.
 OWNERS = ("set", "exposure", "detector", "star")
 _COLOUR, _ZENITH = "colour", ("tan_z", "parallactic_angle")
+_ACCELERATION = "acceleration"
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,25 +99,33 @@ class Term:
             object.__setattr__(self, "covariance", _checked(self.name, self.covariance, len(self.numbers)))
 
     @classmethod
-    def named(cls, name: str, **changed: Any) -> Term:
+    def named(cls, name: str, **changed: Any) -> Term | RandomField:
         """A term that the package has, perhaps with attributes changed.
 
         "refraction", "pixel_phase", "acceleration" (of a star, constant), "orbits" (any smooth path, once round),
-        "rough_static" (what the static distortion of a detector has beyond the degree).
+        "rough_static" (what the static distortion of a detector has beyond the degree), "turbulence" (a random field of
+        every exposure, whose attributes are size, length, smoothness, ratio and angle).
 
         Raises
         ------
         InputError
-            For another name.
+            For another name, and attributes that it has not.
         """
-        if name not in TERMS:
-            raise InputError(f"there is no term {name!r}: give {' or '.join(map(repr, TERMS))}, or a legdistort.Term")
-        return replace(TERMS[name], **changed)
+        known = TERMS | FIELDS
+        if name not in known:
+            raise InputError(f"there is no term {name!r}: give {' or '.join(map(repr, known))}, or a legdistort.Term")
+        has = [field.name for field in fields(known[name])]
+        if strange := [each for each in changed if each not in has]:
+            raise InputError(f"term {name} has no {strange[0]}: it has {', '.join(has)}")
+        return replace(known[name], **changed)
+
+    def lacking(self, table: Table) -> list[str]:
+        """Columns that the term needs and a table of positions lacks."""
+        return [n for n in self.needs if n not in table.colnames and (n != _COLOUR or colour_column(table) is None)]
 
     def check(self, table: Table) -> None:
         """Raise `InputError` for a table of positions that lacks a column which the term needs."""
-        lacking = [n for n in self.needs if n not in table.colnames and (n != _COLOUR or colour_column(table) is None)]
-        if not lacking:
+        if not (lacking := self.lacking(table)):
             return
         what = f"the table of positions lacks the column{'s' * (len(lacking) > 1)} {', '.join(lacking)}"
         cure = "give them (columns=, --columns)"
@@ -151,7 +161,8 @@ class Term:
     def __repr__(self) -> str:
         n = len(self.numbers)
         of = "" if self.owner == "set" else f" of each {self.owner}"
-        return f"<Term {self.name}: {n} number{'s' * (n > 1)}{of}, {self.unit}>"
+        size = "" if self.sigma is None else f"{self.sigma:.3g} "
+        return f"<Term {self.name}: {n} number{'s' * (n > 1)}{of}, {size}{self.unit}>"
 
 
 def _checked(name, covariance, k):
@@ -166,11 +177,58 @@ def _checked(name, covariance, k):
 
 @dataclass(frozen=True)
 class RandomField:
-    """A smooth random field of displacements of every exposure, whose size, length and shape are found: turbulence."""
+    """A smooth random field of displacements of every exposure: turbulence.
+
+    Attributes
+    ----------
+    name, unit, owner : str
+    size : float, optional
+        Standard deviation along an axis, pixels. None: size, length and shape are found from the positions, by
+        `legdistort.solve`, which takes none that are stated; `legdistort.predict` needs them.
+    length : float, optional
+        Of correlation, pixels.
+    smoothness : float
+        Of the covariance, that of Matern: 5/6 is the gradient of a wavefront with von Karman's spectrum, averages over
+        aperture and time are smoother.
+    ratio : float
+        Of the long axis to the short one, where wind draws the field out.
+    angle : float
+        Of the long axis from x towards y, degrees.
+
+    Raises
+    ------
+    InputError
+        For sizes that are no positive numbers, one of size and length alone, and a ratio below 1.
+    """
 
     name: str = "turbulence"
     unit: str = "pix"
     owner: str = "exposure"
+    size: float | None = None
+    length: float | None = None
+    smoothness: float = 3 / 2
+    ratio: float = 1.0
+    angle: float = 0.0
+
+    def __post_init__(self) -> None:
+        if (self.size is None) != (self.length is None):
+            raise InputError(f"{self.name} is stated by its size and its length, both in pixels: give both, or neither")
+        stated = {} if self.size is None else {"size": self.size, "length": self.length}
+        for what, value in (stated | {"smoothness": self.smoothness}).items():
+            check_positive(value, f"{what} of {self.name}", "number")
+        if not (isinstance(self.ratio, Real) and 1 <= self.ratio < np.inf):
+            raise InputError(
+                f"ratio of {self.name} is that of its long axis to its short one, from 1, got {self.ratio!r}"
+            )
+        if not (isinstance(self.angle, Real) and np.isfinite(self.angle)):
+            raise InputError(f"angle of {self.name} must be a number of degrees, got {self.angle!r}")
+
+    @property
+    def kernel(self) -> Kernel:
+        """Its covariance, where that is stated."""
+        turn = 2 * np.radians(self.angle)
+        stretch = np.log(self.ratio) * np.array([np.cos(turn), np.sin(turn)])
+        return Kernel(self.size, self.length, self.smoothness, tuple(stretch.tolist()))
 
     def check(self, table: Table) -> None:
         """Nothing is needed of the table."""
@@ -180,11 +238,12 @@ class RandomField:
         return self
 
     def __repr__(self) -> str:
-        return f"<Term {self.name}: a random field of each exposure, {self.unit}>"
+        stated = "" if self.size is None else f", {self.size:.3g} over lengths of {self.length:.3g}"
+        return f"<Term {self.name}: a random field of each exposure{stated}, {self.unit}>"
 
 
-#: What is told of a random field: its size and length [pix], axis ratio, and angle of its long axis from x [deg].
-FIELD_NUMBERS = "size", "length", "axis ratio", "angle"
+#: What is told of a random field: size and length [pix], smoothness, axis ratio, angle of its long axis from x [deg].
+FIELD_NUMBERS = "size", "length", "smoothness", "axis ratio", "angle"
 #: The terms that the package has, by name.
 TERMS = {
     "refraction": Term("refraction", refraction, ("towards zenith",), unit="pix per unit of colour",
@@ -200,25 +259,50 @@ TERMS = {
 FIELDS = {"turbulence": RandomField()}
 
 
-def terms_of(given: str | Term | Iterable[str | Term] | None, table: Table) -> tuple[Term, ...]:
-    """The terms that were asked for, by name or as objects, checked against the table of positions.
+def listed(given: Any) -> list[Term | RandomField]:
+    """The terms that were asked for, by name or as objects.
 
     Raises
     ------
     InputError
-        For what is none, one that comes twice, and a column that one lacks.
+        For what is none, and one that comes twice.
     """
-    each = [given] if isinstance(given, (str, Term)) else [] if given is None else given
+    each = [given] if isinstance(given, (str, Term, RandomField)) else [] if given is None else given
     if not isinstance(each, (list, tuple)):
         raise InputError(f"terms must be names or Term objects in a list, got {type(given).__name__}")
-    made = []
     for term in each:
-        if not isinstance(term, (str, Term)):
+        if not isinstance(term, (str, Term, RandomField)):
             raise InputError(f"terms must be names or Term objects, got {type(term).__name__}")
-        made.append(FIELDS.get(term) or Term.named(term) if isinstance(term, str) else term)
+    made = [Term.named(term) if isinstance(term, str) else term for term in each]
     names = [term.name for term in made]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"the term {twice[0]!r} is given twice")
+    return made
+
+
+def of_motion(
+    motion: str | None, given: str | Term | RandomField | Iterable[str | Term | RandomField] | None
+) -> tuple[str | None, Any]:
+    """The motion and the terms that are asked for: "acceleration" is "proper" with the term of that name."""
+    if motion != _ACCELERATION:
+        return motion, given
+    made = listed(given)
+    return "proper", made + [Term.named(_ACCELERATION)] * all(term.name != _ACCELERATION for term in made)
+
+
+def terms_of(
+    given: str | Term | RandomField | Iterable[str | Term | RandomField] | None, table: Table
+) -> tuple[Term | RandomField, ...]:
+    """The terms that `legdistort.solve` is asked for, checked against the table of positions.
+
+    Raises
+    ------
+    InputError
+        As `listed`; for a column that one lacks, and a random field whose sizes are stated.
+    """
+    made = listed(given)
     for term in made:
+        if isinstance(term, RandomField) and term.size is not None:
+            raise InputError(f"solve finds the sizes of {term.name}: give its name alone; predict takes stated ones")
         term.check(table)
     return tuple(term.for_table(table) for term in made)

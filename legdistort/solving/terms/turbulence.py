@@ -113,10 +113,11 @@ class Field:
         made = [kernel(places[k : k + apart], part.seen.places) @ strengths for k in range(0, len(places), apart)]
         return np.concatenate(made).reshape(-1, 2)
 
-    def variances(self, i, places, values, root):
-        """Covariance (n, 2, 2) of what is measured at places (n, 2), basis `values` (n_modes, n), by unit errors.
+    def errors(self, i, places, values, root):
+        """Of what is measured in exposure i at places (n, 2): covariance (n, 2, 2) of its field alone, and responses.
 
-        `root` are responses (stars, coefficients) of all unknowns to independent errors of unit size.
+        Those are (n, 2, r), to the independent errors of unit size that all exposures share, of which `root` are the
+        responses (stars, coefficients) of all unknowns. `values` (n_modes, n) are those of the basis.
         """
         part, kernel = self.parts[i], self.found.kernel
         cross = kernel(places, part.seen.places)
@@ -129,8 +130,7 @@ class Field:
         seen = by_stars + part.seen.design @ coefficients[i]
         moved = design.reshape(2 * n, 2 * m) @ coefficients[i] - taken @ seen
         moved, taken, cross = moved.reshape(n, 2, -1), taken.reshape(n, 2, -1), cross.reshape(n, 2, -1)
-        alone = kernel(places[:1], places[:1])
-        return alone - taken @ cross.mT + moved @ moved.mT
+        return kernel(places[:1], places[:1]) - taken @ cross.mT, moved
 
     @property
     def length(self):
@@ -223,10 +223,27 @@ class _Unknowns:
         return changes[:first].reshape(shapes[0]), changes[first:].reshape(shapes[1])
 
 
+def _size(problem):
+    """Unknowns of a `Problem`, and most stars of an exposure."""
+    n = problem.n_stars * problem.n_star + problem.n_exposures * 2 * problem.n_modes
+    return n, int(np.diff(problem.start).max())
+
+
 def can_be_found(problem):
     """Whether a `Problem` is small enough."""
-    n = problem.n_stars * problem.n_star + problem.n_exposures * 2 * problem.n_modes
-    return bool(n <= _MOST and np.diff(problem.start).max() <= _MOST_STARS)
+    n, largest = _size(problem)
+    return n <= _MOST and largest <= _MOST_STARS
+
+
+def check_size(problem):
+    """Raise `SolveError` for a `Problem` that is not small enough."""
+    if not can_be_found(problem):
+        n, largest = _size(problem)
+        raise SolveError(
+            f"turbulence of {problem.n_stars} stars in {problem.n_exposures} exposures has {n} unknowns, "
+            f"{2 * largest} values an exposure: at most {_MOST} and {2 * _MOST_STARS} can be done at once, give fewer "
+            "stars or exposures"
+        )
 
 
 def field_of(fit, displaced, near=None, *, scale=False, weight=None):
@@ -250,15 +267,9 @@ def field_of(fit, displaced, near=None, *, scale=False, weight=None):
         For more stars than can be done at once.
     """
     problem, blocks = fit.weighted, fit.blocks
+    check_size(problem)
     unknowns = _Unknowns(problem.n_stars, problem.n_star, problem.n_exposures, blocks.g_exposure.shape[1])
     parts = _parts(problem, blocks, fit.result.state, displaced, problem.weight if weight is None else weight)
-    largest = max(len(part.rows) for part in parts)
-    if not can_be_found(problem):
-        raise SolveError(
-            f"turbulence of {problem.n_stars} stars in {problem.n_exposures} exposures has {unknowns.size} unknowns, "
-            f"{2 * largest} values an exposure: at most {_MOST} and {2 * _MOST_STARS} can be done at once, give fewer "
-            "stars or exposures"
-        )
     found = near
     if near is None or not near[1]:
         held = unpacked(blocks.v).copy()
@@ -395,24 +406,54 @@ def _beginning(estimate, matches, options, *how):
     return begun, fit.problem.weight
 
 
-def _with_field(fit, field):
-    """The fit with the field in its errors, and with the tables of it."""
+def coefficient_scatter(kernel, problem, blocks, state):
+    """What fields alone make the fitted coefficients of exposures scatter by, (2, n_modes), pixels, rms over these.
+
+    Beyond the noise, and as if the stars were known: polynomials at these stars take part of a field.
+    """
+    check_size(problem)
+    total = 0.0
+    for part in _parts(problem, blocks, state, np.zeros_like(problem.xy), problem.weight):
+        design = part.seen.design
+        known = (design.T @ part.at(each).inverse @ design for each in (kernel, None))
+        total = total + np.subtract(*(np.diag(np.linalg.inv(normal)) for normal in known))
+    return np.sqrt(np.maximum(total / problem.n_exposures, 0)).reshape(2, -1)
+
+
+def errors_of(fit, field):
+    """``errors(i, places)`` of a fit with a field: `Field.errors` with those of all unknowns."""
+    problem, whole = fit.problem, responses(field, fit, unit_errors(field.covariance))
+
+    def errors(i, places):
+        values = basis.values(problem.degree, *basis.normalize(places, problem.shapes[i]))
+        return field.errors(i, places, values, whole)
+
+    return errors
+
+
+def with_errors(fit, field, errors):
+    """The fit with the field in its errors, and in those of new positions, `errors_of`."""
     problem, parts = fit.problem, len(fit.matches.camera.detectors)
     added = responses(field, fit, unit_errors(field.covariance - field.before))
-    whole = responses(field, fit, unit_errors(field.covariance))
     known = fit.camera_errors or CameraErrors.nothing(parts, problem.n_exposures, problem.n_stars, added[1].shape[1])
-    errors = {}
+    made = {}
     for i, (name, shape) in enumerate(zip(problem.names, problem.shapes, strict=True)):
 
-        def covariances(q, i=i, shape=shape):
-            values = basis.values(problem.degree, *basis.normalize(q, shape))
-            return field.variances(i, q, values, whole)
+        def covariances(q, i=i):
+            alone, moved = errors(i, q)
+            return alone + moved @ moved.mT
 
-        errors[name] = CovarianceTable.of(covariances, shape)
-    tables = dict(zip(problem.names, field.tables(problem.shapes), strict=True))
+        made[name] = CovarianceTable.of(covariances, shape)
     return replace(
         fit,
         camera_errors=known.beside(*added, np.zeros((0, added[0].shape[2]))),
         shared_unknowns=fit.shared_unknowns + fit.dof - field.dof,
-        tabled=Tabled(np.zeros_like(problem.xy), own=tables, errors=errors),
+        tabled=Tabled(np.zeros_like(problem.xy), errors=made),
     )
+
+
+def _with_field(fit, field):
+    """The fit with the field in its errors, and with the tables of it."""
+    problem, fit = fit.problem, with_errors(fit, field, errors_of(fit, field))
+    tables = dict(zip(problem.names, field.tables(problem.shapes), strict=True))
+    return replace(fit, tabled=replace(fit.tabled, own=tables))
