@@ -330,6 +330,12 @@ def _of_camera(matches, prior, model, degree, layout, static, exposure_degree):
         )
     check_places(matches)
     sought = Sought.of(matches, layout, static, 3 if isinstance(degree, str) else degree)
+    if prior is not None and prior.table is not None:
+        raise InputError(
+            "the prior has a table beside its series, which is of one detector, and not of a focal plane: take every "
+            "detector by itself (dynamic='detector', --dynamic detector), or give the series alone "
+            "(dataclasses.replace(prior, table=None))"
+        )
     if prior is not None or model is not None:
         return sought, prior
     known, widths = {"source": f"camera {camera.name}"}, common_widths(camera, sought)
