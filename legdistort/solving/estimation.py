@@ -490,7 +490,8 @@ def _tell(fit, matches):
     log.info("%s; chi2 %.1f for %.0f degrees of freedom", fit.result.status, fit.chi2, fit.dof)
     _tell_lost_exposures(fit, matches)
     _tell_lost_stars(fit)
-    if why := known_poses.contradiction(fit.problem, fit.result.state, fit.uncertainty):
+    fields = None if fit.tabled is None else fit.tabled.errors
+    if why := known_poses.contradiction(fit.problem, fit.result.state, fit.uncertainty, fields):
         warn(why, AssumptionWarning)
     if fit.problem.unknowns.shared and (n_weak := fit.result.n_weak):
         warn(
