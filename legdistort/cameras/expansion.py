@@ -3,16 +3,20 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from ..exceptions import InputError
 from ..geometry import basis, detector_modes, similarity
 from ..geometry.distortion import Distortion
+from ..geometry.tabulated.displacement_table import DisplacementTable
 from .source import check_folds
 
 #: Points along a side of the grid that folds and truncation are looked for on, and of the coarser one for the pose.
 CHECK_GRID, POSE_GRID = 129, 33
 #: Least number of quadrature nodes along a side: for maps that are no polynomials.
 NODES = 24
+#: Rounds in which a table is looked up where it leads to, at most, and the change [pix] at which they end.
+_ROUNDS, _SAME = 50, 1e-7
 
 
 def expand(source, degree, parity=None):
@@ -112,6 +116,96 @@ def expand_placed(source, degree, parity, *, shape, offset):
         ) from None
     pose = similarity.compose(shift, similarity.compose(np.column_stack([np.eye(2), offset]), pose))
     return mean, pose, truncation, covered
+
+
+def rough_part(source, coefficients, pose):
+    """What a source has beside its series, as a table at undistorted pixels, and the distance of both together.
+
+    Beyond the edges of the detector it goes on as it went: turned about the nearest point of the edge.
+
+    Parameters
+    ----------
+    source : Source
+        Complete (see `Source.stated`).
+    coefficients, pose
+        Of `expand`.
+
+    Returns
+    -------
+    table : DisplacementTable
+    truncation : float
+        Largest distance [pix] of source and series with table, as of `expand`.
+
+    Raises
+    ------
+    InputError
+        If it changes from pixel to pixel by more than that it can be followed.
+    """
+    to_plane, series = _Plane(source), Distortion(coefficients, source.shape)
+    ends = basis.denormalize(np.array([-1.0, 1.0]), np.array([-1.0, 1.0]), source.shape)
+
+    def inside(pixels):
+        return pixels - series(similarity.apply(pose, to_plane.of_pixels(pixels)))
+
+    def beside(pixels):
+        nearest = np.clip(pixels, *ends)
+        out, beyond = inside(nearest), np.any(nearest != pixels, axis=1)
+        out[beyond] = 2 * out[beyond] - inside(2 * nearest[beyond] - pixels[beyond])
+        return out
+
+    def displacements(q):
+        smooth, found = series(q), np.zeros_like(q)
+        for _ in range(_ROUNDS):
+            found, last = beside(smooth + found), found
+            if np.abs(found - last).max() < _SAME:
+                return found
+        raise InputError(
+            f"{source.name} is too ragged: what no series of degree {series.degree} follows changes from pixel to "
+            f"pixel by {np.abs(found - last).max():.2g} px; smooth it, or raise the degree (--degree)"
+        )
+
+    seen = basis.denormalize(*np.random.default_rng(1).uniform(-1, 1, (2, 10_000)), source.shape)
+    tried = similarity.apply(pose, to_plane.of_pixels(seen))
+    table = DisplacementTable.fine_enough(displacements, source.shape, tried=tried)
+    return table, _truncation(to_plane, pose, Distortion(coefficients, source.shape, table=table))
+
+
+def coefficient_widths(source, coefficients, shape, offset=(0.0, 0.0)):
+    """Standard errors of the coefficients of a series that was made of a source with errors.
+
+    Errors of neighbouring pixels are not independent: maps are made of far fewer stars than they have pixels, by a
+    series or something as smooth. The errors are taken as those of a series, the coefficients of which are independent,
+    and all of which contribute alike to the error at a place: with the variance ``sigma(q)^2 / sum_k b_k(q)^2`` that
+    makes the error there. Of a coefficient it is the mean of this over the detector, weighted by the square of its
+    mode, ``integral of b_m^2 sigma^2 / sum_k b_k^2``. So the mean square of the error over the detector is kept, and
+    errors that are alike for all coefficients are found exactly.
+
+    Parameters
+    ----------
+    source : Source
+        With `Source.errors`, and a direction.
+    coefficients : ndarray, shape (2, n_modes)
+        Of the detector.
+    shape : tuple
+        ``(ny, nx)`` of the detector.
+    offset : tuple of float
+        Pixel (x, y) of the detector on which the first pixel of the source lies; what lies off it does not count.
+
+    Returns
+    -------
+    ndarray, shape (2, n_modes)
+    """
+    degree = basis.degree_of(coefficients.shape[1])
+    u, v, weights = basis.quadrature(max(NODES, 2 * degree + 8))
+    q = basis.denormalize(u, v, shape)
+    at = Distortion(coefficients, shape)(q) - offset
+    at = q - offset if source.direction == "reference_to_detector" else at
+    ends = np.array(source.shape[::-1])
+    weights = weights * np.all((at >= -0.5) & (at <= ends - 0.5), axis=1)
+    square = basis.values(degree, u, v) ** 2
+    sigma = np.stack([map_coordinates(each, at.T[::-1], order=1, mode="nearest") for each in source.errors])
+    needed = sigma**2 / square.sum(axis=0)
+    return np.sqrt((needed * weights) @ square.T / (square @ weights))
 
 
 def _truncation(to_plane, pose, series):

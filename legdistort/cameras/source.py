@@ -17,6 +17,8 @@ from ..runtime.words import DIRECTIONS
 
 #: A map whose cells shrink below this part of the median cell counts as folded.
 FOLD = 0.1
+#: What messages call the maps of shifts and of their errors.
+_MAPS = "x", "y", "x error", "y error"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -47,6 +49,10 @@ class Source:
         Where it was read.
     details : dict
         What else was chosen (extension, frame).
+    errors : ndarray, shape (2, ny, nx), or None
+        Standard errors of the undistorted position of every pixel, along x and y [pix].
+    is_ragged : bool
+        Whether there may be more in it than a series follows, which is then kept as a table.
     """
 
     name: str
@@ -60,6 +66,8 @@ class Source:
     from_middle: bool = False
     files: tuple = ()
     details: dict = field(default_factory=dict)
+    errors: np.ndarray | None = None
+    is_ragged: bool = False
 
     def __repr__(self):
         return f"<Source {self.name}: {self.kind}>"
@@ -145,7 +153,7 @@ def check_folds(plane, pixels, name):
         )
 
 
-def of_maps(dx, dy, name="the maps"):
+def of_maps(dx, dy, *errors, name="the maps"):
     """Look-up tables of the shift [pix] that is added to the position of each pixel, as a smooth function.
 
     A cubic spline through all values; it continues over the outer half of the pixels at the edge.
@@ -153,21 +161,19 @@ def of_maps(dx, dy, name="the maps"):
     Parameters
     ----------
     dx, dy : array_like, shape (ny, nx)
+    *errors : array_like, shape (ny, nx)
+        Two more, their standard errors, or none.
     name : str, optional
         For messages.
     """
-    dx, dy = (np.asarray(a, dtype=float) for a in (dx, dy))
-    if dx.shape != dy.shape or dx.ndim != 2 or min(dx.shape) < 4:
-        raise InputError(
-            f"{name}: shapes {dx.shape} (x) and {dy.shape} (y); the maps must be images of one shape, at least 4 x 4"
-        )
-    for axis, shift in zip("xy", (dx, dy), strict=True):
-        bad = np.argwhere(~np.isfinite(shift))
-        if len(bad):
-            raise InputError(
-                f"{name}: the {axis} map has {len(bad)} values that are not finite, the first at pixel "
-                f"x {bad[0, 1]}, y {bad[0, 0]}; fill them first"
-            )
+    maps = [np.asarray(a, dtype=float) for a in (dx, dy, *errors)]
+    dx, dy, *errors = maps
+    shapes = {a.shape for a in maps}
+    if len(shapes) > 1 or dx.ndim != 2 or min(dx.shape) < 4:
+        each = " and ".join(f"{a.shape} ({word})" for a, word in zip(maps, _MAPS, strict=False))
+        raise InputError(f"{name}: shapes {each}; the maps must be images of one shape, at least 4 x 4")
+    for word, values in zip(_MAPS, maps, strict=False):
+        _check_map(f"{name}: the {word} map", values, is_error=word not in _MAPS[:2])
     ny, nx = dx.shape
     pixels = np.stack(np.meshgrid(np.arange(nx), np.arange(ny)), axis=-1).astype(float)
     check_folds(pixels + np.stack([dx, dy], axis=-1), pixels, name)
@@ -177,7 +183,23 @@ def of_maps(dx, dy, name="the maps"):
         at = np.stack([y, x], axis=-1)
         return x + splines[0](at), y + splines[1](at)
 
-    return Source(name, "pixel shifts", function, usual=DIRECTIONS[0], origin=0, shape=(ny, nx))
+    known = {"errors": np.stack(errors) if errors else None, "is_ragged": True}
+    return Source(name, "pixel shifts", function, usual=DIRECTIONS[0], origin=0, shape=(ny, nx), **known)
+
+
+def _check_map(what, values, *, is_error):
+    """Raise `InputError` for values (ny, nx) that are not finite, and negative errors."""
+    bad = np.argwhere(~np.isfinite(values))
+    if len(bad):
+        cure = "give the width itself (static_sigma, --static-sigma) in their place" if is_error else "fill them first"
+        raise InputError(
+            f"{what} has {len(bad)} values that are not finite, the first at pixel x {bad[0, 1]}, y {bad[0, 0]}; {cure}"
+        )
+    if is_error and np.any(values < 0):
+        y, x = np.argwhere(values < 0)[0]
+        raise InputError(
+            f"{what} has negative values, the first at pixel x {x}, y {y}; it holds standard deviations in pixels"
+        )
 
 
 def _spline(values):

@@ -223,16 +223,16 @@ def do_prior(a):
     """``legdistort prior``."""
     prior = legdistort.Prior.from_file(**given(a, options.EXPANDING))
     prior.write(a.out, overwrite=a.overwrite)
-    rms_x, rms_y = map(float, prior.rms)
+    rms_x, rms_y = rms = prior.rms.tolist()
     figures = {
         "degree": prior.degree,
         "truncation_px": prior.truncation,
-        "rms_px": [rms_x, rms_y],
-        "shape": prior.shape,
-        "source": prior.source,
-    }
-    words = f"degree {prior.degree}, truncation error {prior.truncation:.2g} px"
-    _say(a, f"{words}; the distortion is {rms_x:.3g} px rms in x, {rms_y:.3g} in y; {a.out}", figures)
+        "rms_px": rms,
+        "shape": prior.shape, "source": prior.source,
+    }  # fmt: skip
+    words = f"degree {prior.degree}{' and a table' * (prior.table is not None)}, truncation error"
+    words += f" {prior.truncation:.2g} px; the distortion is {rms_x:.3g} px rms in x, {rms_y:.3g} in y"
+    _say(a, f"{words}; {a.out}", figures)
 
 
 def do_coadd(a):

@@ -356,7 +356,11 @@ LAST_STEP = {
 }
 EXPANDING = {
     "where": Option(
-        "a file or name, or the two maps of shifts in x and y", "sources", nargs="+", metavar="SOURCE", path="read"
+        "a file or name, or the two maps of shifts in x and y, and perhaps two of their errors",
+        "sources",
+        nargs="+",
+        metavar="SOURCE",
+        path="read",
     ),
     "shape": Option("of the detector, where it is not stated", type=int, nargs=2, metavar=("NY", "NX")),
     "degree": Option("total degree of the Legendre series (default 5)", type=int),

@@ -94,7 +94,11 @@ COMMANDS = {
     "prior": _command(
         "a known static distortion as a file for --prior",
         "x.fits y.fits --out prior.asdf",
-        options.out("prior (ASDF)", endings=(".asdf",)),
+        options.out(
+            "prior (ASDF), or with .fits maps NAME_x.fits, NAME_y.fits, and NAME_x_err.fits, NAME_y_err.fits of their "
+            "errors",
+            endings=(".asdf", ".fits"),
+        ),
         options.EXPANDING,
     ),
     "coadd": _command(

@@ -38,10 +38,11 @@ def read_source(where, *, ext=None, frame=None):
 
     Parameters
     ----------
-    where : str, path, or sequence of two of them
+    where : str, path, or sequence of two or four of them
         An ASDF file with a gwcs or a distortion model; a FITS file, or the text of FITS headers, with SIP, TPV or any
         other distortion that astropy reads; a file of Drizzle coefficients; ``gsaoi-1`` ... ``gsaoi-4``;
-        ``siaf:INSTRUMENT/APERTURE``; or two FITS images with the shifts of every pixel in x and in y.
+        ``siaf:INSTRUMENT/APERTURE``; or two FITS images with the shifts of every pixel in x and in y, and perhaps two
+        more with their standard errors.
     ext : int, str or (str, int), optional
         Extension of FITS files, place among several headers of a text, or path in the tree of an ASDF file
         (``"roman.meta.wcs"``), where it is not clear.
@@ -58,10 +59,13 @@ def read_source(where, *, ext=None, frame=None):
         Naming the file, if it is not there, damaged, or holds no distortion.
     """
     if isinstance(where, (list, tuple)):
-        if len(where) == 2:
+        if len(where) in (2, 4):
             return _refuse(_read_maps(where, ext), frame=frame)
         if len(where) != 1:
-            raise InputError(f"a distortion is one source, or two maps (x, then y); got {len(where)}")
+            raise InputError(
+                "a distortion is one source, or two maps (x, then y), perhaps with two of their errors (x, then y); "
+                f"got {len(where)}"
+            )
         where = where[0]
     text = str(where)
     if re.fullmatch(r"gsaoi-[1-4]", text):
@@ -213,14 +217,14 @@ def _leave_out_tables(header, name):
 
 
 def _read_maps(paths, ext):
-    x, y = map(str, paths)
-    swapped = [(a, b) for a, b in zip(Path(x).name, Path(y).name, strict=False) if a != b]
-    if len(x) == len(y) and [(a.lower(), b.lower()) for a, b in swapped] == [("y", "x")]:
-        raise InputError(f"{x} and {y}: the map of the shifts in x comes first, then that in y")
-    name = f"{x}, {y}"
+    names = [str(path) for path in paths]
+    for x, y in zip(names[::2], names[1::2], strict=True):
+        swapped = [(a, b) for a, b in zip(Path(x).name, Path(y).name, strict=False) if a != b]
+        if len(x) == len(y) and [(a.lower(), b.lower()) for a, b in swapped] == [("y", "x")]:
+            raise InputError(f"{x} and {y}: the map of the shifts in x comes first, then that in y")
     maps = [read_exposures(path, ext=ext)[0] for path in paths]
-    shifts = [np.where(image.mask, np.nan, image.data) for image in maps]
-    return replace(of_maps(*shifts, name=name), files=tuple(map(Path, paths)))
+    values = [np.where(image.mask, np.nan, image.data) for image in maps]
+    return replace(of_maps(*values, name=", ".join(names)), files=tuple(map(Path, paths)))
 
 
 # -- text

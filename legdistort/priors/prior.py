@@ -13,6 +13,8 @@ import numpy as np
 from ..cameras.source import check_shape
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import basis
+from ..geometry.distortion import TABLE_TOLERANCE
+from ..geometry.tabulated.displacement_table import DisplacementTable
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees.facts import SIZE, array, number
@@ -99,18 +101,23 @@ class Prior(ShownAsPrinted):
     source : str or dict, optional
         Where it comes from, in words, or item by item (kind, name, direction, files with their checksums); kept with
         the solution.
+    table : DisplacementTable, optional
+        What the static distortion has beside the series of the mean, taken as exact: from maps that no series follows.
+        `legdistort.solve` has it as a part of the distortion of every exposure; `legdistort.predict` and cameras leave
+        it out.
 
     Attributes
     ----------
     truncation : float
-        Largest distance [pix] on the detector between the mean and the model it was made from (0 if given directly).
+        Largest distance [pix] on the detector between mean and table together and the model they were made from (0 if
+        given directly).
     plane : ndarray or None
         Pose (2, 3) from the plane of that model to undistorted pixels: the similarity taken out of the mean.
 
     Raises
     ------
     InputError
-        For arrays of the wrong length or values that are not finite.
+        For arrays of the wrong length or values that are not finite, and a table that is none, or without a mean.
 
     See Also
     --------
@@ -137,8 +144,11 @@ class Prior(ShownAsPrinted):
     truncation: float = field(default=0.0, metadata=number(entry="truncation_px", minimum=0, unit="pix"))
     plane: np.ndarray | None = field(default=None, metadata=array(2, 3, unit="pix", invertible=True))
     source: str | dict[str, Any] | None = None
+    table: DisplacementTable | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.table, DisplacementTable | None) or (self.table is not None and self.mean is None):
+            raise InputError("table must be a DisplacementTable beside a mean, or None: see Prior.from_file")
         is_sought = isinstance(self.sigma, str) and self.sigma == EVIDENCE
         if self.mean is None and is_sought and self.static_sigma is None:
             object.__setattr__(self, "mean", np.zeros((2, 1)))
@@ -229,6 +239,7 @@ class Prior(ShownAsPrinted):
         words += [
             f"{name} {'by evidence' if isinstance(v, str) else 'given'}" for name, v in widths.items() if v is not None
         ]
+        words += ["table beside"] if self.table is not None else []
         return f"<Prior: {', '.join(words)}>"
 
     @property
@@ -253,7 +264,7 @@ class Prior(ShownAsPrinted):
 
     @property
     def rms(self) -> np.ndarray:
-        """Root mean square of the mean over the detector [pix], x and y; zero without one."""
+        """Root mean square of the mean, its series, over the detector [pix], x and y; zero without one."""
         if self.mean is None:
             return np.zeros(2)
         return np.sqrt((self.mean**2).sum(axis=1)) / 2  # the basis has unit norm on [-1, 1]^2, of area 4
@@ -301,7 +312,8 @@ class Prior(ShownAsPrinted):
             Pixel (x, y) of the detector, 0-based, on which the first pixel of a source lies that has another size than
             the detector, whose size is then `shape`. Where the source does not reach, its polynomial is continued.
         sigma, static_sigma
-            As for `Prior`.
+            As for `Prior`. Without `static_sigma` the errors of maps that have some make it
+            (`legdistort.cameras.expansion.coefficient_widths`).
 
         Raises
         ------
@@ -313,7 +325,7 @@ class Prior(ShownAsPrinted):
         AssumptionWarning
             If the source covers only a part of the detector, which the warning states.
         """
-        from ..cameras.expansion import expand
+        from ..cameras.expansion import coefficient_widths, expand, rough_part
         from .from_objects import as_source
 
         source, degree = as_source(model, frame=frame), basis.check_degree(degree)
@@ -327,11 +339,16 @@ class Prior(ShownAsPrinted):
                 )
             source = source.stated(direction=direction, origin=origin)
             known = _placed(source, degree, parity, check_shape(shape), offset)
-            return cls(**known, sigma=sigma, static_sigma=static_sigma)
-        source = source.stated(shape=shape, direction=direction, origin=origin)
-        mean, plane, truncation = expand(source, degree, parity)
-        known = {"shape": source.shape, "truncation": truncation, "plane": plane, "source": source.record()}
-        return cls(mean, sigma=sigma, static_sigma=static_sigma, **known)
+        else:
+            source = source.stated(shape=shape, direction=direction, origin=origin)
+            mean, plane, truncation = expand(source, degree, parity)
+            known = {"mean": mean, "plane": plane, "truncation": truncation}
+            if source.is_ragged and truncation > TABLE_TOLERANCE:
+                known["table"], known["truncation"] = rough_part(source, mean, plane)
+            known |= {"shape": source.shape, "source": source.record()}
+        if static_sigma is None and source.errors is not None:
+            static_sigma = coefficient_widths(source, known["mean"], known["shape"], offset or (0.0, 0.0))
+        return cls(**known, sigma=sigma, static_sigma=static_sigma)
 
     @classmethod
     def from_file(
@@ -346,10 +363,11 @@ class Prior(ShownAsPrinted):
 
         Parameters
         ----------
-        where : str, path, or sequence of two of them
+        where : str, path, or sequence of two or four of them
             ``prior.asdf``, ``solution.asdf`` or the folder with it (`from_solution`), or any source of
-            `legdistort.priors.from_files.read_source`: ASDF with a gwcs or a model, FITS headers, two FITS maps,
-            Drizzle coefficients, ``gsaoi-1`` ... ``gsaoi-4``, ``siaf:INSTRUMENT/APERTURE``.
+            `legdistort.priors.from_files.read_source`: ASDF with a gwcs or a model, FITS headers, two FITS maps and
+            perhaps those of their errors, Drizzle coefficients, ``gsaoi-1`` ... ``gsaoi-4``,
+            ``siaf:INSTRUMENT/APERTURE``. Of maps, what the series leaves out is kept as `table`.
         ext : int, str or (str, int), optional
             Extension of FITS files, header of a text, or place in the tree of an ASDF file.
         frame : str, optional
@@ -431,9 +449,22 @@ class Prior(ShownAsPrinted):
         return of_solution(solution, cls, {})
 
     def write(self, path: StrPath, *, overwrite: bool = False) -> Path:
-        """Write everything to an ASDF file (`legdistort.priors.storage`)."""
+        """Write everything to an ASDF file (`legdistort.priors.storage`).
+
+        Or, as ``NAME.fits``, the mean and the table as maps of shifts, ``NAME_x.fits`` and ``NAME_y.fits``, and with
+        `static_sigma` maps of their errors, ``NAME_x_err.fits`` and ``NAME_y_err.fits`` (`legdistort.priors.maps`).
+
+        Raises
+        ------
+        InputError
+            If a file exists; for maps, without a mean or the shape of the detector, or with infinite errors.
+        """
+        from .maps import write_maps
         from .storage import write_prior
 
+        if Path(path).suffix.lower() == ".fits":
+            write_maps(self, path, overwrite=overwrite)
+            return Path(path)
         return write_prior(self, path, overwrite=overwrite)
 
     @classmethod

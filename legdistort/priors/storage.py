@@ -118,9 +118,11 @@ def of_solution(solution, kind, source):
     if len(shapes) > 1:
         name = source.get("name", "the solution")
         raise InputError(f"{name} has detectors of several shapes, {sorted(shapes)}; it gives no single prior")
-    tables = [each.distortion.table for each in solution if each.distortion.table is not None]
-    left = max((float(np.hypot(*table.values).max()) for table in tables), default=0.0)
-    known = {"shape": shapes.pop(), "source": {"kind": "solution"} | source, "truncation": left}
+    own, static = solution.estimate.displacement_tables, solution.estimate.static_tables
+    common = next(iter(static.values())) if len(static) == 1 else None
+    left_out = [*own.values(), *(static.values() if common is None else ())]
+    left = max((float(np.hypot(*table.values).max()) for table in left_out), default=0.0)
+    known = {"shape": shapes.pop(), "source": {"kind": "solution"} | source, "truncation": left, "table": common}
     statics = found(solution).statics
     if len(statics) != 1:
         return kind(solution.coefficients.mean(axis=0), **known)

@@ -332,6 +332,12 @@ def _of_camera(matches, prior, model, degree, layout, static, exposure_degree):
         )
     check_places(matches)
     sought = Sought.of(matches, layout, static, 3 if isinstance(degree, str) else degree)
+    if prior is not None and prior.table is not None:
+        raise InputError(
+            "the prior has a table beside its series, which is of one detector, and not of a focal plane: take every "
+            "detector by itself (dynamic='detector', --dynamic detector), or give the series alone "
+            "(dataclasses.replace(prior, table=None))"
+        )
     if prior is not None or model is not None:
         return sought, prior
     known, widths = {"source": f"camera {camera.name}"}, common_widths(camera, sought)
@@ -486,7 +492,8 @@ def _tell(fit, matches):
     log.info("%s; chi2 %.1f for %.0f degrees of freedom", fit.result.status, fit.chi2, fit.dof)
     _tell_lost_exposures(fit, matches)
     _tell_lost_stars(fit)
-    if why := known_poses.contradiction(fit.problem, fit.result.state, fit.uncertainty):
+    fields = None if fit.tabled is None else fit.tabled.errors
+    if why := known_poses.contradiction(fit.problem, fit.result.state, fit.uncertainty, fields):
         warn(why, AssumptionWarning)
     if fit.problem.unknowns.shared and (n_weak := fit.result.n_weak):
         warn(

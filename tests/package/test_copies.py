@@ -21,6 +21,7 @@ from legdistort.assessment import baselines
 from legdistort.cameras.camera import Camera
 from legdistort.cameras.detector import Detector
 from legdistort.exceptions import AssumptionWarning, InputError, MatchError
+from legdistort.geometry.tabulated.displacement_table import DisplacementTable
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.inputs.exposure_files import open_exposures, read_exposures
 from legdistort.inputs.exposures import Exposure
@@ -84,6 +85,7 @@ def prior():
     return Prior(
         RNG.normal(0, 1, (2, 6)), sigma=RNG.uniform(0.1, 1, (2, 6)), static_sigma=RNG.uniform(0.1, 1, (2, 6)),
         shape=SHAPE, truncation=0.25, plane=np.array([[2.0, 0.1, 3.0], [-0.1, 2.0, 4.0]]), source=record,
+        table=DisplacementTable(RNG.normal(0, 0.1, (2, 3, 4)), (-5.0, -6.0), (20.0, 30.0)),
     )  # fmt: skip
 
 
@@ -228,9 +230,9 @@ CASES = {
         {"widths": {"sigma": "is what was asked for"}},
     ),
     "Prior without a mean": Case(
-        lambda: replace(prior(), mean=None, sigma=None, static_sigma=0.5),
+        lambda: replace(prior(), mean=None, sigma=None, static_sigma=0.5, table=None),
         {"file": prior_file, "widths": lambda given, path: given.with_sigma(None)},
-        unset={"sigma": "is the scatter around a mean"},
+        unset={"sigma": "is the scatter around a mean", "table": "is beside a mean"},
     ),
     "Exposure": Case(
         exposure,

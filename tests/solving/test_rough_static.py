@@ -1,5 +1,8 @@
 """The term "rough_static": a static distortion that is rough, beside the Legendre series. Truth made by numpy alone."""
 
+from copy import copy
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -10,8 +13,10 @@ from legdistort.cameras.camera import Camera
 from legdistort.cameras.detector import Detector
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.geometry import basis
+from legdistort.geometry.tabulated.covariance_table import CovarianceTable
 from legdistort.geometry.tabulated.rough_basis import RoughBasis
 from legdistort.results import new_positions
+from legdistort.solving.gauge import known_poses
 from legdistort.wcs.storage import write_wcs
 
 SMALL = {"size": 1500, "holes_along": 12, "n_exposures": 7, "noise": 0.0015, "highest": 9.0, "rough": 0.1}
@@ -78,8 +83,8 @@ def test_it_is_a_part_of_the_distortion(mask, solution, tmp_path):
     assert_array_equal(back["m0"].correct(p), views[0].correct(p))
     known = {"errors": np.zeros_like(p)}
     assert_allclose(back["m0"].correct(p, **known).relative, views[0].correct(p, **known).relative, rtol=1e-6)
-    left = np.hypot(*views[0].distortion.table.values).max()
-    assert_allclose(ld.Prior.from_solution(solution).truncation, left)  # a prior has the series alone
+    prior = ld.Prior.from_solution(solution)
+    assert (prior.table, prior.truncation) == (views[0].distortion.table, 0)
     x, y = ld.read_wcs(write_wcs(views[0], tmp_path / "w.asdf"))(*p.T)
     assert_allclose(np.column_stack([x, y]), views[0].correct(p), atol=1e-3)
 
@@ -129,3 +134,24 @@ def test_where_it_cannot_be(mask):
     if matches.camera.has_focal_plane:
         with pytest.raises(InputError, match=r"rough_static is of detectors by .*dynamic='detector'"):
             ld.solve(matches, degree=2, terms="rough_static")
+
+
+def test_poses_follow_the_errors_of_the_term(mask, monkeypatch):
+    """Poses that are exactly those given depart by the errors of the splines, which is no contradiction."""
+    calls, asked = [], known_poses.contradiction
+    monkeypatch.setattr(known_poses, "contradiction", lambda *given: calls.append(given) or asked(*given))
+    with pytest.warns(AssumptionWarning) as told:  # some of the series is not determined by shifts
+        mask.solve(terms="rough_static", pose_sigma={"shift": 3e-4, "rotation": 1e-6, "scale": 2e-8})
+    assert not any("poses depart" in str(each.message) for each in told)
+    ((problem, state, uncertainty, _),) = calls
+    alone = copy(uncertainty)
+    alone.camera = None
+    assert "poses depart" in asked(problem, state, alone)
+    wrong = problem.given_poses.copy()
+    wrong[3, 0, 2] += 0.5
+    said = asked(replace(problem, given_poses=wrong), state, uncertainty)
+    assert "poses depart" in said
+    assert "most in exposure m3" in said
+    for size, departs in ((1e-6, True), (1.0, False)):  # of a random field in every exposure, that may move poses
+        field = CovarianceTable(np.full((3, 2, 2), size**2), (-0.5, -0.5), (mask.size, mask.size))
+        assert bool(asked(problem, state, alone, dict.fromkeys(problem.names, field))) == departs

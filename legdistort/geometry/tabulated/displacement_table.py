@@ -10,6 +10,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from ...exceptions import InputError
 from ...runtime.trees.facts import array, number
+from ..basis import denormalize
 from .fast_tabular import FastTabular2D
 from .linear import interpolated, slopes
 
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 MOST_CELLS = 1024
 #: Nodes beyond the detector on every side, by its longer side: undistorted pixels reach there.
 MARGIN = 1 / 64
+#: What tables that are `fine_enough` lose between their nodes, pixels; cells along the longer side to begin with.
+LOST, _FEWEST = 2e-4, 32
 #: Irregularity of the nodes of a model, by their distance.
 _IRREGULAR = 1e-9
 
@@ -100,6 +103,35 @@ class DisplacementTable:
         nodes = np.stack(np.meshgrid(x, y), axis=-1)
         values = np.asarray(displacements(nodes.reshape(-1, 2))).T.reshape(2, len(y), len(x))
         return cls(values, (low, low), (float(apart[0]), float(apart[1])))
+
+    @classmethod
+    def fine_enough(
+        cls,
+        displacements: Callable[[np.ndarray], np.ndarray],
+        shape: tuple[int, int],
+        step: ArrayLike | None = None,
+        *,
+        tried: np.ndarray | None = None,
+    ) -> DisplacementTable:
+        """Tabulate displacements with nodes so near that 0.0002 pixels are lost between them, or as near as can be.
+
+        Parameters
+        ----------
+        displacements, shape
+            As of `of`.
+        step : (2,) array_like, optional
+            To begin with, along x and y.
+        tried : ndarray, shape (n, 2), optional
+            Where it is looked what is lost; by default places all over the detector.
+        """
+        if tried is None:
+            tried = denormalize(*np.random.default_rng(1).uniform(-1, 1, (2, 10_000)), shape)
+        exact, apart = displacements(tried), np.full(2, max(shape) / _FEWEST) if step is None else np.asarray(step)
+        while True:
+            table = cls.of(displacements, shape, tuple(apart))
+            if np.abs(table(tried) - exact).max() <= LOST or max(table.values.shape) > MOST_CELLS:
+                return table
+            apart = apart / 2
 
     @classmethod
     def from_models(cls, along_x: Model, along_y: Model) -> DisplacementTable:

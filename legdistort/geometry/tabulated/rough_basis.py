@@ -17,7 +17,7 @@ from scipy.interpolate import BSpline
 
 from ...runtime.trees.facts import SIZE, number
 from .. import basis
-from .displacement_table import MARGIN, MOST_CELLS, DisplacementTable
+from .displacement_table import MARGIN, DisplacementTable
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 _CUBIC = 3
 #: Curvature, in units of the field over half the longer side squared, of what else would have none: it is taken off.
 _LOW = 0.1
-#: Nodes of a table by knots, at least; what is lost between nodes, pixels; positions that are looked at together.
-_FINE, _LOST, _PIECE = 8, 2e-4, 1 << 15
+#: Nodes of a table by knots, at least; positions that are looked at together.
+_FINE, _PIECE = 8, 1 << 15
 
 
 @dataclass(frozen=True)
@@ -74,13 +74,7 @@ class RoughBasis:
             return self.fields(q, np.transpose(numbers))
 
         knots = np.array(self.shape[::-1]) / (np.array(self.splines) - _CUBIC)
-        tried = basis.denormalize(*np.random.default_rng(1).uniform(-1, 1, (2, 10_000)), self.shape)
-        exact, fine = displacements(tried), _FINE
-        while True:
-            table = DisplacementTable.of(displacements, self.shape, tuple(knots / fine))
-            if np.abs(table(tried) - exact).max() <= _LOST or max(table.values.shape) > MOST_CELLS:
-                return table
-            fine *= 2
+        return DisplacementTable.fine_enough(displacements, self.shape, knots / _FINE)
 
     def _parts(self, q):
         """B-splines, sparse (n, n_functions), and Legendre modes (n_modes, n) at undistorted pixels (n, 2)."""

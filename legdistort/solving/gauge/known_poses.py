@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..equations import effective_modes
+from ..equations import criterion, effective_modes
 from ..equations.criterion import complement
 
 #: Departures of poses from those known are said from so many standard deviations of their squares on.
@@ -55,13 +55,27 @@ def _of_scatter(gauge):
     return known.T @ np.linalg.solve(spread @ gauge.covariance @ spread.T + _SMALLEST**2 * np.eye(len(known)), known)
 
 
-def contradiction(problem, state, uncertainty):
-    """In a sentence, that poses depart by much more from those given than their errors lead to expect; empty if not."""
+def contradiction(problem, state, uncertainty, fields=None):
+    """In a sentence, that poses depart by much more from those given than their errors lead to expect; empty if not.
+
+    What terms displace is taken off the positions as it was found, and poses follow its errors: those of numbers by
+    `uncertainty`, those of random fields by ``{exposure: CovarianceTable}``, as large as they can be, which is if the
+    error of a field is of the kind of a pose alone.
+    """
     if problem.pose_width is None:
         return ""
     squares = ((problem.pose_departure(state)[0] / problem.pose_width) ** 2).sum(axis=1)
     plain = replace(problem, prior_sigma=None, static_sigma=None)
     expected = squares.size * 4 - effective_modes.done_by_prior(plain, uncertainty).sum()
+    if uncertainty.camera is not None:
+        precision = criterion.pose_precision(problem)
+        by_terms = [np.sum(each * uncertainty.camera.of_coefficients(i)) for i, each in enumerate(precision)]
+        expected += np.sum(by_terms)
+    for i, name in enumerate(problem.names):
+        if name in (fields or {}):
+            x, y = fields[name].values[:2].mean(axis=(1, 2))
+            most = 4 * np.array([x, y, (x + y) / 2, (x + y) / 2])  # a mode has mean square 1/4
+            expected += np.sum(most / problem.pose_width[i] ** 2)
     if squares.sum() < expected * (1 + _ODD * np.sqrt(2 / (4 * squares.size))):
         return ""
     return (

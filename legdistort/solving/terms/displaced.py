@@ -9,6 +9,8 @@ from astropy import units as u
 
 from ...exceptions import LegdistortError
 from ...matching.matches import DISPLACED
+from ..equations.problem import by_exposure
+from .observed import undistorted
 
 #: Fits at most, and the largest change of a number, or of displacements, in errors, at which they end.
 FITS, SMALL = 10, 0.02
@@ -36,9 +38,32 @@ def taken_off(fit):
     return np.stack([table[name].to_value(u.pix)[fit.problem.order] for name in DISPLACED])
 
 
+def known_tables(prior, matches):
+    """``{exposure: DisplacementTable}`` of what a prior, or dict of priors, has beside its series."""
+    each = zip(matches.names, by_exposure(matches, prior), strict=True)
+    return {name: known.table for name, known in each if known is not None and known.table is not None}
+
+
+def by_tables(tables, fit):
+    """What tables by exposure displace the observations of a fit by, at undistorted places, (2, n) pixels."""
+    problem, out = fit.problem, np.zeros_like(fit.problem.xy)
+    q = undistorted(problem, fit.result.state) if tables else None
+    for i, name in enumerate(problem.names):
+        if name in tables:
+            part = problem.part(i)
+            out[:, part] = tables[name](q[part]).T
+    return out
+
+
+def in_errors(fit, displacements):
+    """The largest of displacements (2, n) of a fit, in errors."""
+    (wx, wy, wxy), (x, y) = fit.problem.weight, displacements
+    return float(np.sqrt(np.max(wx * x**2 + 2 * wxy * x * y + wy * y**2, initial=0.0)))
+
+
 @dataclass(frozen=True, eq=False)
 class Tabled:
-    """What terms found that is a part of distortions.
+    """What terms found, or a prior knows, that is a part of distortions beside its series.
 
     Attributes
     ----------

@@ -25,7 +25,7 @@ from ...results.errors.camera_errors import CameraErrors, unit_errors
 from ..equations.common_parts import followed, relative_responses, response
 from ..equations.elimination import inverse_star_blocks
 from ..equations.star_terms import unpacked
-from .displaced import FITS, SMALL, Tabled, displaced, taken_off, unclipped
+from .displaced import FITS, SMALL, Tabled, by_tables, displaced, in_errors, known_tables, taken_off, unclipped
 from .field_of_one import FieldOfOne, fit_with_field_of_one
 from .observed import Observed
 from .random_field import Found
@@ -48,7 +48,7 @@ _MOST, _VALUES = 3000, 100_000_000
 
 
 def fit_with(terms, tie, estimate, matches, options, *how):
-    """What `estimate` gives, with the terms found beside.
+    """What `estimate` gives, with the terms found beside, and what priors have beside their series taken off.
 
     Parameters
     ----------
@@ -73,27 +73,30 @@ def fit_with(terms, tie, estimate, matches, options, *how):
     Raises
     ------
     SolveError
-        For more numbers than can be found at once.
+        For more numbers than can be found at once, and a random field beside other terms or a prior with a table.
     """
-    if not terms:
+    tables = known_tables(options.prior, matches)
+    if not (terms or tables):
         fit, *rest = estimate(matches, options, *how)
         return fit, lambda _: (), rest
     if any(isinstance(term, RandomField) for term in terms):
-        return _fit_with_field(terms, tie, estimate, matches, options, *how)
+        return _fit_with_field(terms, tables, tie, estimate, matches, options, *how)
     values, begun = {}, unclipped(estimate, matches, options, *how)
     for number in range(FITS):
         fit, *rest = begun or estimate(matches, options, *how)
-        begun = None
-        numbers = _Numbers.of(terms, fit, values)
+        begun, known = None, by_tables(tables, fit)
+        numbers = _Numbers.of(terms, fit, values, known * bool(number))
         taken = np.array([values.get(key, 0.0) for key in numbers.keys])
         step = numbers.step(fit, taken)
         values = dict(zip(numbers.keys, step.values, strict=True))
-        if number and step.length < SMALL:
+        moved = known + numbers.patterns @ taken - taken_off(fit) if tables else np.zeros_like(known)
+        length = max(step.length, in_errors(fit, moved))
+        if number and length < SMALL:
             break
-        matches = displaced(fit, numbers.patterns @ step.values)
+        matches = displaced(fit, numbers.patterns @ step.values + known)
     else:
-        warn(f"terms have not settled: the last change was {step.length:.2g} of an error", ConvergenceWarning)
-    fit = replace(_with_errors(fit, step, numbers), tabled=numbers.tabled(fit, taken))
+        warn(f"terms have not settled: the last change was {length:.2g} of an error", ConvergenceWarning)
+    fit = replace(_with_errors(fit, step, numbers), tabled=numbers.tabled(fit, taken, tables))
     return fit, partial(numbers.found, step), rest
 
 
@@ -136,9 +139,14 @@ def _check_alone(terms):
         raise SolveError(f"turbulence cannot be found beside other terms yet: leave out {others}, or turbulence")
 
 
-def _fit_with_field(terms, tie, estimate, matches, options, *how):
+def _fit_with_field(terms, tables, tie, estimate, matches, options, *how):
     """`fit_with` of a random field alone."""
     _check_alone(terms)
+    if tables:
+        raise SolveError(
+            "turbulence cannot be found beside a prior that has a table beside its series yet: give the series alone "
+            "(dataclasses.replace(prior, table=None)), or leave turbulence out"
+        )
     if tie is not None and len(matches.names) == 1:
         fit, field, rest = fit_with_field_of_one(estimate, tie, matches, options, *how)
     else:
@@ -213,10 +221,14 @@ class _Numbers:
     patterns: np.ndarray
 
     @classmethod
-    def of(cls, terms, fit, values):
-        """Those of some terms in the observations of a `Fit`, made with values ``{key: value}`` of them."""
-        keys, n_owners, sizes, roots, patterns, bases = [], [], [], [], [], []
-        for term, names, owner, columns, known, functions in _made(terms, fit, values):
+    def of(cls, terms, fit, values, beside):
+        """Those of some terms in the observations of a `Fit`, made with values ``{key: value}`` of them.
+
+        What else was taken off the positions are displacements `beside` (2, n).
+        """
+        keys, n_owners, sizes, roots, bases = [], [], [], [], []
+        patterns = [np.zeros((*beside.shape, 0))]
+        for term, names, owner, columns, known, functions in _made(terms, fit, values, beside):
             bases.append(functions)
             asked = _asked(fit, term, owner, columns, known) if term.each else np.arange(len(names))
             k, n = len(term.numbers), len(asked)
@@ -235,8 +247,8 @@ class _Numbers:
             sizes.append(np.full(n, k) if term.each else [n * k])
             n_owners.append(len(names) if term.each else 1)
             roots += [np.eye(k) if term.covariance is None else np.linalg.cholesky(term.covariance)] * n
-        term_of = np.repeat(np.arange(len(terms)), list(map(len, sizes)))
-        group = np.repeat(np.arange(len(term_of)), np.concatenate(sizes).astype(int))
+        term_of = np.repeat(np.arange(len(terms)), np.array(list(map(len, sizes)), dtype=int))
+        group = np.repeat(np.arange(len(term_of)), np.concatenate([[], *sizes]).astype(int))
         root = None if all(term.covariance is None for term in terms) else linalg.block_diag(*roots)
         return cls(terms, keys, n_owners, group, term_of, bases, root, np.concatenate(patterns, axis=2))
 
@@ -297,9 +309,12 @@ class _Numbers:
         every = np.flatnonzero(self.term_of[self.group] == t)
         return every[step.sizes[self.group[every]] > 0] if self.terms[t].each else every
 
-    def tabled(self, fit, values):
-        """What is a part of distortions, as `Tabled`, with the values (k,) in a `Fit`; None for nothing."""
-        static, beside = {}, np.array(values)
+    def tabled(self, fit, values, tables):
+        """What is a part of distortions, as `Tabled`, with the values (k,) in a `Fit` and the tables of priors.
+
+        None for nothing.
+        """
+        (static, own), beside = _by_detector(tables, fit), np.array(values)
         for t, functions in enumerate(self.bases):
             every = np.flatnonzero(self.term_of[self.group] == t)
             if not functions or not values[every].any():
@@ -307,8 +322,9 @@ class _Numbers:
             beside[every] = 0
             owners = dict.fromkeys(self.keys[k][1] for k in every)
             for each, owner, mine in zip(functions, owners, np.split(values[every], len(owners)), strict=True):
-                static[owner] = each.table(mine.reshape(2, -1))
-        return Tabled(fit.problem.in_table_order(self.patterns @ beside), static) if static else None
+                found = each.table(mine.reshape(2, -1))
+                static[owner] = found + static[owner] if owner in static else found
+        return Tabled(fit.problem.in_table_order(self.patterns @ beside), static, own) if static or own else None
 
     def found(self, step, scale):
         """The `FittedTerm` of every term, with errors times a factor."""
@@ -368,7 +384,7 @@ def _posterior(normal, pull, scale):
     return (covariance + covariance.T) / 2, covariance @ pull
 
 
-def _made(terms, fit, values):
+def _made(terms, fit, values, beside):
     """Of every term: itself, names of its owners, that of every observation (n,), columns (k, 2, n), values by owner.
 
     And the functions of the place by owner, where it is a part of distortions.
@@ -381,7 +397,7 @@ def _made(terms, fit, values):
         problem, state, table, matches.times[0], matches.sky, matches.camera, matches.stars, problem.terms.epoch
     )
     off = np.stack([np.asarray(table[name].value) - xy for name, xy in zip("xy", problem.xy, strict=True)])
-    off, made, moved = off + fit.blocks.residual, [], np.zeros((len(terms), 2, len(table)))
+    off, made, moved = off - beside + fit.blocks.residual, [], np.zeros((len(terms), 2, len(table)))
     for _ in range(1 + bool(values)):
         made = []
         for t, term in enumerate(terms):
@@ -433,13 +449,32 @@ def _owners(term, observed):
         return [str(name) for name in observed.stars], problem.star
     if term.owner == "set":
         return [""], np.zeros(len(observed.exposure), dtype=int)
-    if "detector" in observed.table.colnames:
-        names, number = np.unique(np.asarray(observed.table["detector"]).astype(str), return_inverse=True)
+    return _detectors(problem, observed.table, observed.camera)
+
+
+def _detectors(problem, table, camera):
+    """Names of detectors, and the number of that of every observation (n,)."""
+    if "detector" in table.colnames:
+        names, number = np.unique(np.asarray(table["detector"]).astype(str), return_inverse=True)
         return names.tolist(), number
-    number, n = problem.detectors[observed.exposure], int(problem.detectors.max()) + 1
-    if observed.camera is not None and len(observed.camera.detectors) == n:
-        return list(observed.camera.detectors), number
+    number, n = problem.detectors[problem.exposure], int(problem.detectors.max()) + 1
+    if camera is not None and len(camera.detectors) == n:
+        return list(camera.detectors), number
     return [str(k + 1) for k in range(n)], number
+
+
+def _by_detector(tables, fit):
+    """Tables of exposures as those of detectors where all of a detector have the same, and those that are left."""
+    problem, static, own = fit.problem, {}, {}
+    names, number = _detectors(problem, fit.matches.table[problem.order], fit.matches.camera) if tables else ([], None)
+    for j, name in enumerate(names):
+        seen = [problem.names[i] for i in np.unique(problem.exposure[number == j])]
+        each = [tables.get(exposure) for exposure in seen]
+        if all(table is each[0] for table in each):
+            static |= {name: each[0]} if each[0] is not None else {}
+        else:
+            own |= {exposure: tables[exposure] for exposure in seen if exposure in tables}
+    return static, own
 
 
 def _with_errors(fit, step, numbers):

@@ -51,28 +51,28 @@ class Kernel:
     stretch: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def ratio(self):
+    def ratio(self) -> float:
         """Of the long axis to the short one."""
         return float(np.exp(np.hypot(*self.stretch)))
 
     @property
-    def angle(self):
+    def angle(self) -> float:
         """Of the long axis from x towards y, degrees."""
         return float(np.degrees(np.arctan2(self.stretch[1], self.stretch[0]) / 2))
 
     @property
-    def metric(self):
+    def metric(self) -> np.ndarray:
         """M (2, 2)."""
         ratio, angle = np.hypot(*self.stretch), np.arctan2(self.stretch[1], self.stretch[0]) / 2
         turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         return np.exp([[-ratio / 2], [ratio / 2]]) * turn / self.length
 
-    def __call__(self, places, others):
+    def __call__(self, places: np.ndarray, others: np.ndarray) -> np.ndarray:
         """Covariance (2 n, 2 m) of displacements at places (n, 2) and others (m, 2), pixels^2; x and y of each."""
         blocks = self.blocks(*(np.subtract.outer(places @ row, others @ row) for row in self.metric))
         return blocks.transpose(0, 2, 1, 3).reshape(2 * len(places), 2 * len(others))
 
-    def blocks(self, u, v):
+    def blocks(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Covariances (..., 2, 2) of displacements that are M d = (u, v) apart."""
         shape = self.size * self.metric * self.length
         far = np.sqrt(u * u + v * v)
