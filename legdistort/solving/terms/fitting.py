@@ -125,7 +125,7 @@ def forecast(terms, fit):
         field, _ = field_of(fit, np.zeros_like(fit.problem.xy), known)
         errors = errors_of(fit, field)
         return with_errors(fit, field, errors), errors
-    numbers = _Numbers.of(terms, fit, {})
+    numbers = _Numbers.of(terms, fit, {}, np.zeros_like(fit.problem.xy))
     made = _with_errors(fit, numbers.step(fit, np.zeros(len(numbers.keys))), numbers)
     known, added = fit.uncertainty.coefficients, made.camera_errors.coefficients
     if known.ndim == 2:
