@@ -251,7 +251,7 @@ def test_frames_that_do_not_serve():
     empty = Exposure("empty", rng.normal(100, 5, (200, 200)), gain=GAIN)
     with pytest.raises(InputError, match="empty: no star above 5 times the noise shows how wide stars are; give fwhm"):
         ld.calibrate_noise(empty)
-    curves = ld.calibrate_noise(empty, fwhm=4.0, n_positions=8)
+    curves = ld.calibrate_noise(empty, fwhm=4.0, n_positions=20)
     assert curves.table.meta["fwhm"] == {"empty": None}
     assert np.isfinite(curves.sigma(1e4))
     with pytest.raises(InputError, match="nor stars that would determine the photon noise; give gain"):
@@ -303,7 +303,7 @@ def test_command(tmp_path, capsys):
 def test_scatter_of_real_stars_follows_the_curve(microobservatory):
     """Twelve real, undersampled, drifting frames: solved, and the scatter of every star beside its curve."""
     exposures, detections = microobservatory
-    curves = ld.calibrate_noise(exposures, fluxes=np.geomspace(30, 3000, 5), n_positions=8)
+    curves = ld.calibrate_noise(exposures, fluxes=np.geomspace(30, 3000, 5), n_positions=10)
     matches = ld.match(detections, exposures=exposures)
     assert len(matches.names) == 12
     solution = ld.solve(matches, degree=2, clip=5.0)
