@@ -264,7 +264,7 @@ def test_frames_that_do_not_serve():
         ld.calibrate_noise(replace(field(1), saturation=SKY + 25))
     with pytest.raises(InputError, match="errors must be one of 'fit', 'injected', 'scaled', got 'best'"):
         ld.measure(field(1), errors="best")
-    faint = ld.calibrate_noise(field(1), fluxes=[20.0, 30.0], n_positions=10)
+    faint = ld.calibrate_noise(field(1), fluxes=[20.0, 30.0], n_positions=20)
     with pytest.raises(InputError, match="field1: too few injected stars were found for a noise curve; raise fluxes"):
         faint.sigma(1e3)
     with pytest.raises(InputError, match="no noise curve for exposure 'else'; there are field1"):
@@ -303,7 +303,7 @@ def test_command(tmp_path, capsys):
 def test_scatter_of_real_stars_follows_the_curve(microobservatory):
     """Twelve real, undersampled, drifting frames: solved, and the scatter of every star beside its curve."""
     exposures, detections = microobservatory
-    curves = ld.calibrate_noise(exposures, fluxes=np.geomspace(30, 3000, 5), n_positions=10)
+    curves = ld.calibrate_noise(exposures, fluxes=np.geomspace(30, 3000, 5), n_positions=20)
     matches = ld.match(detections, exposures=exposures)
     assert len(matches.names) == 12
     solution = ld.solve(matches, degree=2, clip=5.0)
