@@ -284,7 +284,7 @@ def of_motion(
     motion: str | None, given: str | Term | RandomField | Iterable[str | Term | RandomField] | None
 ) -> tuple[str | None, Any]:
     """The motion and the terms that are asked for: "acceleration" is "proper" with the term of that name."""
-    if motion != _ACCELERATION:
+    if not (isinstance(motion, str) and motion == _ACCELERATION):
         return motion, given
     made = listed(given)
     return "proper", made + [Term.named(_ACCELERATION)] * all(term.name != _ACCELERATION for term in made)
