@@ -87,7 +87,8 @@ def how_to_forget(message, arguments):
     """What to add to a message about options that are repeated and contradict those that are given; else nothing."""
     repeated = getattr(arguments, "repeated", ())
     if repeated:  # the folder may have the name of an option
-        message = message.replace(str(getattr(arguments, "from")), "")
+        folder = re.escape(str(getattr(arguments, "from")))
+        message = re.sub(rf"(?<![\w./-]){folder}(?![\w/-])", "", message)
     flags = [flag for flag in repeated if re.search(rf"(?<![\w-])({flag}|{_name(flag)})(?![\w-])", message)]
     if not flags:
         return ""

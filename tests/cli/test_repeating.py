@@ -1,5 +1,6 @@
 """A run that goes on from an earlier one has the options of that, but for those that are given."""
 
+import argparse
 import json
 import shutil
 from pathlib import Path
@@ -132,3 +133,16 @@ def test_what_is_not_there_is_not_forgotten(words, message, tmp_path, capsys, mo
     earlier(tmp_path, "--degree", "2")
     assert main(["run", *words, "--out", "second"]) == 1
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("folder", "message", "hint"),
+    [
+        ("static", "an earlier run static has no positions", ""),
+        ("static", "exposure_degree needs --static fit", "; --forget static leaves out what is repeated from static"),
+        ("t", "exposure_degree needs --static fit", "; --forget static leaves out what is repeated from t"),
+    ],
+)
+def test_a_folder_with_the_name_of_an_option_is_not_it(folder, message, hint):
+    arguments = argparse.Namespace(repeated=["--static"], **{"from": folder})
+    assert repeating.how_to_forget(message, arguments) == hint
