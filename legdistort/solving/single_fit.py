@@ -33,6 +33,8 @@ TRIAL, EXPLAINED = 0.03, 2.0
 #: Typical errors by which a bend of the plane moves stars in second order where it counts, and so where chance does not
 #: explain the residuals.
 SHOWN, SHOWN_BY_MISFIT = 1.0, 0.25
+#: Times the least eigenvalue of what residuals show: below it, and with room for one that moves, the rest is held.
+_FREER = 0.5
 
 
 def threads(matches):
@@ -227,6 +229,7 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
         start, typical = start_values.start(problem, nominal, robust=options.loss != "linear")
     everything = np.ones(problem.xy.shape[1], dtype=bool)
     common = {"loss": options.loss, "max_iterations": options.max_iterations}
+    problem, start = _with_shown(problem, start, common)
     if options.clip is None:
         if options.loss != "linear" and (lost := _misplaced(problem, typical)):
             return minimise(matches.without(lost), options, judged=judged)
@@ -278,6 +281,25 @@ def _problem(matches, options):
         motion=star_motions.terms_of(options),
         night_sigma=options.night_sigma,
     )
+
+
+def _with_shown(problem, start, common):
+    """The problem in which a shared distortion that exposures determine badly is free as far as residuals show it.
+
+    And chance explains about what this leaves of them: else they show something else. With where a fit of it ended.
+    """
+    plain = _plain(problem, start, common) if problem.unknowns.shared else None
+    start = start if plain is None else plain.state
+    while plain is not None and plain.n_weak:
+        system = plain.system or Uncertainty(problem.scaled(plain.robust), plain.blocks, plain.gauge).system
+        if system.shown is None:
+            break
+        freer = replace(problem, weak=_FREER * system.shown)
+        plain = _plain(freer, plain.state, common)
+        if plain is None or not plain.converged or plain.blocks.chi2 > EXPLAINED * plain.blocks.residual.size:
+            break
+        problem, start = freer, plain.state
+    return problem, start
 
 
 def _plain(problem, start, common):

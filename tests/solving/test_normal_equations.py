@@ -374,12 +374,12 @@ class Counted:
         return self.function(*arguments)
 
 
-def test_what_exposures_share_is_held_where_they_do_not_tell_it(monkeypatch):
+def test_what_exposures_share_is_held_where_they_do_not_tell_it():
     """The rows found, given again, hold the same directions: the answer stays, and none of them moves."""
     problem, state = make(shared=True)
+    problem = replace(problem, weak=0.002)
     blocks = criterion.linearise(problem, state)
     gauge = constraints.make("minimal", problem, state, blocks)
-    monkeypatch.setattr(reduced_system, "_WEAK", 0.002)
     found = Direct(problem, blocks, gauge)
     assert 0 < found.n_weak < problem.unknowns.n_common
     weak = found.rows[-found.n_weak :]

@@ -6,6 +6,8 @@ import numpy as np
 
 from ...results.errors.common_maps import fitted, plain_maps
 from ...results.new_positions import widened_all
+from . import elimination
+from .star_terms import symmetric_times
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +53,16 @@ def followed(respond, problem, blocks, patterns):
     stars = np.empty((*blocks.g_star.shape, k))
     coefficients = np.empty((*blocks.g_exposure.shape, k))
     gradients = [_gradient(problem, blocks, patterns[:, :, j], moved[:, :, j]) for j in range(k)]
-    whole = np.array([np.concatenate([each.ravel() for each in pair]) for pair in gradients]).reshape(k, -1)
-    for j, pair in enumerate(gradients):
-        stars[:, :, j], coefficients[:, :, j] = respond(*pair)
-    normal -= whole @ np.concatenate([coefficients.reshape(-1, k), stars.reshape(-1, k)])
-    pull = -np.einsum("ank,an->k", moved, blocks.residual)
+    whole, held = np.empty((2, k, blocks.g_exposure.size + blocks.g_star.size))
+    for j, (own, star) in enumerate(gradients):
+        stars[:, :, j], coefficients[:, :, j] = respond(own, star)
+        at = coefficients[:, :, j], stars[:, :, j]
+        whole[j] = np.concatenate([own.ravel(), star.ravel()])
+        held[j] = np.concatenate([each.ravel() for each in _products(problem, blocks, *at)])
+    steps = np.concatenate([coefficients.reshape(-1, k), stars.reshape(-1, k)])
+    normal += (held - 2 * whole) @ steps  # at its least: what steps lack counts squared
+    left = np.concatenate([blocks.g_exposure.ravel(), blocks.g_star.ravel()])
+    pull = left @ steps - np.einsum("ank,an->k", moved, blocks.residual)
     return Followed(stars, coefficients, (normal + normal.T) / 2, alone, pull)
 
 
@@ -86,6 +93,12 @@ def relative_responses(follow, changes, result, weights, degree):
     common = fitted(maps, weights, stars)
     coefficients = follow.coefficients @ changes + widened_all(gauge.all_motion, degree) @ common
     return stars - maps @ common, coefficients
+
+
+def _products(problem, blocks, coefficients, stars):
+    """The normal equations times steps of coefficients (n_exposures, 2 n_modes) and stars (2 + m, n_stars)."""
+    own = np.einsum("iab,ib->ia", blocks.u, coefficients) + elimination.to_exposures(problem, blocks, stars)
+    return own, symmetric_times(blocks.v, stars) + elimination.to_stars(problem, blocks, coefficients)
 
 
 def _weighted(problem, patterns):

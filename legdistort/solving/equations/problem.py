@@ -75,6 +75,8 @@ class Problem:
         Group of exposures with common stars that every exposure is in, directly or through others.
     moving : StarTerms or None
         How stars move from exposure to exposure; None: they do not.
+    weak : float
+        Eigenvalue of the normalised equations below which a distortion that exposures share is held.
     """
 
     degree: int
@@ -99,6 +101,7 @@ class Problem:
     pose_width: np.ndarray | None = None
     field: np.ndarray | int = 0
     moving: StarTerms | None = None
+    weak: float = 1e-3
 
     @cached_property
     def unequal(self):

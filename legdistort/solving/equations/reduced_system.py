@@ -37,7 +37,8 @@ _CLEAR_PIVOT = 0.03  # of an exposure whose stars determine its coefficients wel
 _LEAST_PIVOT = 1e-7  # of the normalised equations, below which they count as singular
 _ALONE = 1e-6  # of what the stars would determine if they were known: where nothing else does, as in one exposure
 _ROUNDING = 1e-12  # of a variance, what is left where the constraints hold all of it
-_WEAK = 1e-3  # eigenvalue of the normalised equations below which a common distortion is not determined
+_SHOWN = 9.0  # squares that a common distortion which is held costs, in errors, from which the residuals show it
+_NOTHING = 1e-9  # eigenvalue of the normalised equations that is rounding
 
 
 def reduced_system(problem, blocks, gauge, weak=None):
@@ -110,6 +111,8 @@ class Direct(Reduced):
         If S is singular beyond the gauge, naming the exposures concerned.
     """
 
+    _weak = np.zeros(0), np.zeros((0, 0))
+
     def __init__(self, problem, blocks, gauge, weak=None):
         super().__init__(problem, blocks, gauge)
         s = elimination.reduced_triangle(problem, blocks)
@@ -153,7 +156,8 @@ class Direct(Reduced):
         """
         if rows is None:
             values, vectors = np.linalg.eigh(s)
-            weak = vectors[:, values < _WEAK]
+            weak = vectors[:, values < self.problem.weak]
+            self._weak = values[: weak.shape[1]], weak
         else:
             weak = (rows * self._unit).T
         self.n_weak = weak.shape[1]
@@ -164,6 +168,16 @@ class Direct(Reduced):
             )
         s += weak @ weak.T
         self.rows = np.concatenate([self.rows, weak.T / self._unit])
+
+    @property
+    def shown(self):
+        """Least eigenvalue of what is held of a common distortion and the residuals show nevertheless; None if none."""
+        values, vectors = self._weak
+        told = np.maximum(values, _NOTHING)
+        gain = (vectors.T @ (self._unit * self.rhs)) ** 2 / told
+        left = max(self.blocks.chi2 - gain.sum(), 0.0) / self.problem.xy.size
+        shown = values[(values > _NOTHING) & (gain > _SHOWN * max(left, 1.0))]
+        return shown.min() if len(shown) else None
 
     def _apply_inverse(self, b):
         unit = self._unit if b.ndim == 1 else self._unit[:, None]
