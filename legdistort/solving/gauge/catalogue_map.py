@@ -33,6 +33,8 @@ _CHANCE = 5.0  # standard deviations of chi2 by which chance explains offsets
 _EXACT = 1e-12  # px^2: what counts as known without error
 #: Beginnings of a search for the majority; a median pull, in those expected, up to which chance explains it.
 _STARTS, _BEST, _USUAL = 100, 10, 1.3
+#: Stars among which that search begins; the best beginnings go on with all.
+_FIRST = 600
 #: Mismatches from which their share tells from which pull an offset is one, and the least of these.
 _SEVERAL, _LEAST = 3, 3.0
 _SQRT = np.sqrt(2 * np.log(2))  # median of the length of a normal vector in two dimensions
@@ -129,6 +131,12 @@ class MapEquations:
         """The same with other errors of the reference, by a factor."""
         offsets = replace(self.offsets, covariance=factor**2 * self.offsets.covariance)
         return MapEquations(offsets, self.directions, self.relative, self.prior, self.bends)
+
+    def of_some(self, which):
+        """The same for some of the offsets."""
+        names = ("rows", "values", "covariance")
+        offsets = replace(self.offsets, **{name: getattr(self.offsets, name)[which] for name in names})
+        return MapEquations(offsets, self.directions, self.relative, self.prior, self.bends[which])
 
     def without_prior(self):
         """The same with nothing known of the map beforehand."""
@@ -355,25 +363,30 @@ def _majority(equations):
     n, rng = len(equations.offsets.rows), np.random.default_rng(0)
     order = np.argsort(equations.offsets.rows)  # whatever the order of the reference
     modes = (equations.design.shape[2] + equations.bends.shape[2]) // 2
-    few, enough = min(n, modes + 1), min(n, (n + modes + 1) // 2)
+    few = min(n, modes + 1)
 
-    def nearest(used):
+    def nearest(equations, used):
+        n = len(used)
         squares, of_map = equations.squares(used)
-        part = np.argsort(squares)[:enough]
+        part = np.argsort(squares)[: min(n, (n + modes + 1) // 2)]
         return squares[part].sum() + of_map, np.isin(np.arange(n), part)
 
-    starts = [np.ones(n, dtype=bool)]
-    starts += [np.isin(np.arange(n), order[rng.permutation(n)[:few]]) for _ in range(_STARTS)]
+    first, some = np.arange(n), equations
+    if n > _FIRST:
+        first = order[rng.permutation(n)[:_FIRST]]
+        some, order = equations.of_some(first), np.arange(_FIRST)
+    starts = [np.ones(len(first), dtype=bool)]
+    starts += [np.isin(np.arange(len(first)), order[rng.permutation(len(first))[:few]]) for _ in range(_STARTS)]
     found = []
     for used in starts:
         for _ in range(2):
-            size, used = nearest(used)
-        found.append((size, used))
+            size, used = nearest(some, used)
+        found.append((size, np.isin(np.arange(n), first[used])))
     best = []
     for size, used in sorted(found, key=lambda each: each[0])[:_BEST]:
         for _ in range(_ROUNDS):
             before = used
-            size, used = nearest(before)
+            size, used = nearest(equations, before)
             if np.array_equal(used, before):
                 break
         best.append((size, used))

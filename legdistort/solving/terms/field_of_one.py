@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from ...geometry.tabulated.covariance_table import CovarianceTable
-from ...geometry.tabulated.displacement_table import DisplacementTable
+from ...geometry.tabulated.displacement_table import MARGIN, DisplacementTable
 from ...results.errors.absolute_errors import variances
 from ..equations.star_terms import unpacked
 from .displaced import Tabled, displaced, taken_off
@@ -74,29 +74,37 @@ class FieldOfOne:
     def tables(self, shape):
         """`DisplacementTable` and `CovarianceTable` of the field over a detector."""
         apart = np.sqrt(shape[0] * shape[1] / len(self.places))
-        step = max(min(self.kernel.length / _CELLS, apart / _CELLS_A_STAR), max(shape) / _MOST_CELLS)
-        table = DisplacementTable.of(lambda q: self.at(q)[0], shape, step).refined(_FINER)
+        least = (1 + 2 * MARGIN) * max(shape) / _MOST_CELLS
+        step = max(min(self.kernel.length / _CELLS, apart / _CELLS_A_STAR), least)
+        table = DisplacementTable.of(lambda q: self.at(q, _fours(q))[0], shape, step).refined(_FINER)
         return table, CovarianceTable.of(lambda q: self.at(q)[1], shape)
 
-    def at(self, places, told=_TOLD):
-        """The field (n, 2) at places (n, 2), pixels, and its covariance (n, 2, 2)."""
-        kernel, told = self.found.kernel, min(told, len(self.places))
+    def at(self, places, groups=None):
+        """The field (n, 2) at places (n, 2), pixels, and its covariance (n, 2, 2).
+
+        Groups (n_groups, m) of places are told by the same stars, by default each has its own.
+        """
+        groups = np.arange(len(places))[:, None] if groups is None else groups
+        kernel, told = self.found.kernel, min(_TOLD + 2 * (groups.shape[1] - 1), len(self.places))
         metric = kernel.metric
         stars, where = self.places @ metric.T, np.asarray(places, dtype=float) @ metric.T
-        near = cKDTree(stars).query(where, k=told)[1].reshape(len(where), told)
+        near = cKDTree(stars).query(where[groups].mean(axis=1), k=told)[1].reshape(len(groups), told)
         field, covariance = np.empty((len(where), 2)), np.empty((len(where), 2, 2))
         alone = kernel.blocks(np.zeros(1), np.zeros(1))[0]
-        for first in range(0, len(where), _AT_ONCE):
-            part = slice(first, first + _AT_ONCE)
-            inner, cross = _covariances(kernel, stars[near[part]], where[part], self.noise[near[part]])
-            weights = np.linalg.solve(inner, cross)
-            field[part] = np.einsum("nka,nk->na", weights, self.offsets[near[part]].reshape(len(cross), -1))
-            covariance[part] = alone - weights.mT @ cross
+        for first in range(0, len(groups), _AT_ONCE):
+            rows, seen = (each[first : first + _AT_ONCE] for each in (groups, near))
+            inner, cross = _covariances(kernel, stars[seen], where[rows], self.noise[seen])
+            weights = np.linalg.solve(inner, cross.reshape(*inner.shape[:2], -1)).reshape(cross.shape)
+            field[rows] = np.einsum("nkma,nk->nma", weights, self.offsets[seen].reshape(len(cross), -1))
+            covariance[rows] = alone - np.einsum("nkma,nkmb->nmab", weights, cross)
         return field, covariance
 
 
 def _covariances(kernel, stars, places, noise):
-    """Covariance (n, 2 k, 2 k) of offsets of stars (n, k, 2), and with the field at places, (n, 2 k, 2); in lengths."""
+    """Covariance (n, 2 k, 2 k) of offsets of stars (n, k, 2), and with the field at places (n, m, 2), (n, 2 k, m, 2).
+
+    All in lengths.
+    """
     n, k = stars.shape[:2]
     first, second = np.triu_indices(k)
     between = kernel.blocks(*np.moveaxis(stars[:, first] - stars[:, second], 2, 0))
@@ -105,8 +113,16 @@ def _covariances(kernel, stars, places, noise):
     pair[first, second] = pair[second, first] = np.arange(len(first))  # covariances of two stars are symmetric
     for a, b in np.ndindex(2, 2):
         inner[:, :, a, :, b] = np.take(between[..., a, b], pair, axis=1)
-    cross = kernel.blocks(*np.moveaxis(stars - places[:, None], 2, 0))
-    return inner.reshape(n, 2 * k, 2 * k), cross.reshape(n, 2 * k, 2)
+    cross = kernel.blocks(*np.moveaxis(stars[:, :, None] - places[:, None], 3, 0))
+    return inner.reshape(n, 2 * k, 2 * k), cross.swapaxes(2, 3).reshape(n, 2 * k, -1, 2)
+
+
+def _fours(nodes):
+    """Nodes (n, 2) of a table, row by row, in groups (n_groups, 4) of neighbours."""
+    n_x = int(np.argmax(np.diff(nodes[:, 1]) > 0)) + 1
+    number = np.arange(len(nodes)).reshape(-1, n_x)
+    number = np.pad(number, [(0, n % 2) for n in number.shape], mode="edge")
+    return number.reshape(len(number) // 2, 2, -1, 2).swapaxes(1, 2).reshape(-1, 4)
 
 
 def field_in(places, offsets, noise):
@@ -121,7 +137,8 @@ def field_in(places, offsets, noise):
         at, near = order[targets], order[given[targets]]
         metric = kernel.metric
         stars, where = places[near] @ metric.T, places[at] @ metric.T
-        inner, cross = _covariances(kernel, stars, where, scaled[near])
+        inner, cross = _covariances(kernel, stars, where[:, None], scaled[near])
+        cross = cross[:, :, 0]
         both = np.linalg.solve(inner, np.concatenate([cross, offsets[near].reshape(len(near), -1, 1)], axis=2))
         left = offsets[at] - np.einsum("nka,nk->na", cross, both[..., 2])
         rest = kernel.blocks(np.zeros(1), np.zeros(1))[0] + scaled[at] - cross.mT @ both[..., :2]
