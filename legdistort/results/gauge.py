@@ -416,8 +416,15 @@ class Gauge(ShownAsPrinted):
 
     @property
     def absolute_error(self) -> float:
-        """Error of the common map, rms over the field and axis, pixels; what is unknown and noise of stars aside."""
-        return float(np.sqrt(np.nansum([error**2 for *_, error in self.absolute_errors()])))
+        """Error of the common map, rms over the stars and axis, pixels; what is unknown and noise of stars aside.
+
+        Errors of its degrees (`absolute_errors`) may be larger, each by itself over the whole field.
+        """
+        covariance = self.absolute_covariance
+        if self.responses is None or len(covariance) != 2 * self.n_modes:
+            return float(np.sqrt(np.nansum([error**2 for *_, error in self.absolute_errors()])))
+        moved = self.directions.reshape(-1, len(covariance))
+        return float(np.sqrt(np.einsum("nm,mk,nk->", moved, covariance, moved, optimize=True) / len(moved)))
 
     @property
     def unknown_names(self) -> list[str]:

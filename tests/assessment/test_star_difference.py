@@ -155,7 +155,7 @@ def test_stars_are_compared_where_maps_cannot_be():
 @pytest.mark.slow
 def test_chances_of_stars_are_even():
     """Halves of eight nights, with motions: squares over those of the errors, and p, which is anything."""
-    sets = (Nights(seed, n_stars=120, motion=0.05) for seed in range(12))
+    sets = (Nights(seed, n_stars=120, motion=0.05) for seed in range(8))
     found = [ld.difference(*halves(nights, motion="proper")).stars for nights in sets]
     for each in ("places", "motions"):
         ratios, chances = (np.array([getattr(getattr(f, each), name) for f in found]) for name in ("ratio", "p"))

@@ -53,6 +53,18 @@ def test_unknown_directions_are_taken_off_to_second_order(name):
     assert np.isfinite(some[:40]).all()
 
 
+@pytest.mark.parametrize("name", ["prior, exact", "no prior, rolls"])
+def test_the_error_of_the_common_map_is_what_it_adds_to_stars(name):
+    """Degrees of a map whose errors hang together may each be known worse than all of them at the stars."""
+    solution, _ = offsets(name, n_exposures=4)
+    absolute, relative = (
+        np.stack([solution.stars[f"{axis}_err{kind}"].value ** 2 for axis in "xy"]) for kind in ("_abs", "")
+    )
+    assert solution.gauge.absolute_error == pytest.approx(np.sqrt(np.nanmean(absolute - relative)), rel=0.1)
+    apart = np.sqrt(np.nansum([error**2 for *_, error in solution.gauge.absolute_errors()]))
+    assert apart > 1.1 * solution.gauge.absolute_error
+
+
 def test_known_offsets_are_those_after_a_similarity_where_all_is_known():
     solution, true = offsets("prior, exact", n_exposures=4)
     assert solution.gauge.unknown == ()

@@ -122,7 +122,7 @@ def tree_of(path):
 
 
 def check(path, read, use, monkeypatch, module, n):
-    """Read and use n of the changed trees, all for None; the file is not written anew, which takes longest."""
+    """Read and use n of the changed trees; the file is not written anew, which takes longest."""
     rng, used = np.random.default_rng(1), 0
     cases = list(changed(tree_of(path), rng))
     for k in rng.permutation(len(cases))[:n]:
@@ -138,15 +138,15 @@ def check(path, read, use, monkeypatch, module, n):
             assert "Error" not in str(error), what  # noqa: PT017
         except Exception as error:
             pytest.fail(f"{what}: {error!r}")
-    assert n is not None or used < len(cases)
+    assert n < 10 or used < n
 
 
-SOME_OR_ALL = pytest.mark.parametrize(
-    "n", [pytest.param(4, id="some"), pytest.param(None, id="all", marks=pytest.mark.slow)]
+SOME_OR_MANY = pytest.mark.parametrize(
+    "n", [pytest.param(4, id="some"), pytest.param(30, id="many", marks=pytest.mark.slow)]
 )
 
 
-@SOME_OR_ALL
+@SOME_OR_MANY
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.LegdistortWarning")  # these sets tell little
 def test_solutions(kind, n, tmp_path, monkeypatch):
@@ -173,7 +173,7 @@ def test_what_fits_together_is_refused_by_name(tmp_path, monkeypatch):
             Solution.read(path)
 
 
-@SOME_OR_ALL
+@SOME_OR_MANY
 @pytest.mark.parametrize("kind", ["prior", "camera", "wcs"])
 def test_other_files(kind, n, tmp_path, monkeypatch):
     path, static = tmp_path / "f.asdf", np.array([[0, 0, 0, 0.3, 0, 0.1]] * 2)

@@ -335,7 +335,7 @@ def absolute_check(solution, others):
         sentence, _, cure = warning.partition("; ")
         return Check("absolute", "unknown", len(unknown), 0, sentence, cure + _by_headers(solution, unknown))
     error = solution.gauge.absolute_error
-    known = f"absolute positions are known to {error:.2g} px rms per axis over the field, the noise of stars aside"
+    known = f"absolute positions are known to {error:.2g} px rms per axis over the stars, their noise aside"
     return Check("absolute", "pass", error, None, f"{known}; they rest on {_grounds(solution.gauge, others)}")
 
 
