@@ -35,7 +35,10 @@ _CONVENTIONS = {
 #: What was known of the static distortion: how the errors come about, and why something is unknown.
 _STATIC = {
     "open": ("no scatter of single exposures was assumed", ""),
-    "none": ("no static distortion was given, or none that is known in all its parts", "the scatter of single exposures"),
+    "none": (
+        "no static distortion was given, or none that is known in all its parts",
+        "the scatter of single exposures",
+    ),
     "fitted": ("no uncertainty of the static distortion was given", "the scatter of single exposures"),
     "exact": ("", "the scatter of single exposures; the static distortion given is taken as exact"),
     "uncertain": ("", "the scatter of single exposures and the uncertainty of the static distortion"),
