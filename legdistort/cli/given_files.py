@@ -8,6 +8,7 @@ from pathlib import Path
 
 import legdistort
 
+from ..assessment.night_data import EXACT
 from ..coaddition.grids import given_grid, read_grid
 from ..exceptions import InputError, some_of
 from ..inputs import column_contract
@@ -158,7 +159,10 @@ def _said_of_scatter(scatter, n):
     """The scatter of n sources, by degree from 1, and how well they tell it: that of Gaussian deviates."""
     count = [2 if degree == 1 else 2 * (degree + 1) for degree in range(1, len(scatter) + 1)]
     errors = [size / (2 * (n - 1) * k) ** 0.5 for size, k in zip(scatter, count, strict=True)]
-    sizes = ", ".join(f"{size:.2g} +- {error:.1g}" for size, error in zip(scatter, errors, strict=True))
+    sizes = ", ".join(
+        f"{size:.2g} +- {error:.1g}" if size >= EXACT else f"below {EXACT}"
+        for size, error in zip(scatter, errors, strict=True)
+    )
     degrees = "degree 1, 2, ..." if len(scatter) > 1 else "degree 1"
     return f"static_sigma is their scatter, {sizes} px a coefficient at {degrees}, with the error of the mean"
 

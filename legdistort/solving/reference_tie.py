@@ -445,7 +445,7 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
     there = reference.at(epoch, moving=fit.problem.terms.n > 0)
     identified = _identified(fit, there, pixel_scale)
     lost = len(reference) - len(there)
-    why = f"; {lost} are left out: they have no proper motion with errors, which leads to {epoch or 0:.2f}"
+    why = f"; {lost} are left out: they have no proper motion with errors to take them to {epoch or 0:.2f}"
     log.info(
         "%d of the %d stars of %s are in the exposures%s",
         len(identified.rows), len(reference), reference.label, why * bool(lost),

@@ -574,7 +574,7 @@ def test_stars_left_out_for_the_want_of_a_motion_are_counted(night, caplog, epoc
     with caplog.at_level(logging.INFO, logger="legdistort"):
         solve(night.matches, prior=Prior(night.truth.static), reference=table, epoch=epoch)
     told = next(line for line in caplog.messages if "of the reference are in the exposures" in line)
-    words = f"; {n} are left out: they have no proper motion with errors, which leads to {epoch:.2f}"
+    words = f"; {n} are left out: they have no proper motion with errors to take them to {epoch:.2f}"
     assert re.fullmatch(rf"\d+ of the {len(table)} stars of the reference are in the exposures{words * (n > 0)}", told)
 
 

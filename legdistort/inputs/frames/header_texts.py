@@ -7,6 +7,8 @@ from astropy.io import fits
 from ...exceptions import AssumptionWarning, some_of, warn
 from ..exposure_names import exposure_name
 
+#: Endings of such files.
+TEXTS = ".head", ".ahead"
 _END = re.compile(r"^END *$", re.MULTILINE)
 #: A card without which a text is no header that leads anywhere.
 _FIRST = re.compile(r"^(CTYPE1|SIMPLE) *=", re.MULTILINE)
@@ -38,7 +40,7 @@ def text_of(headers):
 
 def beside(path):
     """Where SWarp looks for the headers of a file, instead of those that are in it."""
-    return path.with_name(f"{exposure_name(path)}.head")
+    return path.with_name(f"{exposure_name(path)}{TEXTS[0]}")
 
 
 def warn_of_texts(paths):
