@@ -12,12 +12,11 @@ import asdf
 import numpy as np
 from astropy import units as u
 from astropy.table import QTable
-from scipy import special
 
 from ..cameras import storage as camera_files
 from ..cameras.camera import Camera
 from ..cameras.detector import Detector
-from ..exceptions import InputError, some_of
+from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry import basis, detector_modes, epochs
 from ..inputs.table_files import records
 from ..plots.memory_plots import plot_memory
@@ -32,8 +31,8 @@ from ..runtime.parallel import map_items
 from ..runtime.trees import codec
 from ..runtime.trees.facts import SIZE, array, number
 from .combined_nights import Chain, contradiction, fitted, own_scatter2
-from .known_maps import MEAN_SQUARE
-from .night_data import Night, check_nights, dates_of, night_of
+from .known_maps import MEAN_SQUARE, chance
+from .night_data import EXACT, Night, check_nights, dates_of, night_of
 
 if TYPE_CHECKING:
     from astropy.time import Time
@@ -192,7 +191,7 @@ class CombinedNights(ShownAsPrinted):
         for n, night in enumerate(self.nights):
             own = self._widths * (night.n_nights == 1)
             chi2, dof, away = contradiction(self._chain, n, own) if count > 1 else (0.0, 0, np.zeros(1))
-            p = float(special.fdtrc(dof, night.dof, chi2 / dof)) if dof else 1.0
+            p = chance(chi2, dof, night.dof)
             rms = np.sqrt(np.sum(away**2) / MEAN_SQUARE)
             date = np.nan if night.date is None else night.date
             counts = night.n_nights, night.n_exposures, night.n_stars
@@ -323,7 +322,7 @@ class CombinedNights(ShownAsPrinted):
 
 @plain_numbers
 def combine_nights(
-    results: Sequence[Solution | CombinedNights | StrPath],
+    results: Sequence[Solution | CombinedNights | Prior | StrPath],
     *,
     name: str | None = None,
     workers: int | None = None,
@@ -332,12 +331,14 @@ def combine_nights(
     """Combine nights to one static distortion of the camera, with what each night adds found from all.
 
     Of every night counts what its exposures tell of the static distortion by dithers and rolls, whatever prior it was
-    solved with, so that a prior counts nowhere. What a night does not determine it does not state.
+    solved with, so that a prior counts nowhere. What a night does not determine it does not state. A map of another
+    program is a night that states all, to its `static_sigma` or else to 0.001 pixels: of several `Prior.from_file` of
+    headers it is their mean, and their scatter.
 
     Parameters
     ----------
-    results : list of Solution, CombinedNights or path
-        Solutions of nights or fields, folders with one, and earlier combinations, to which the others are added.
+    results : list of Solution, CombinedNights, Prior or path
+        Solutions of nights or fields, folders with one, maps, and earlier combinations, to which the others are added.
     name : str, optional
         Of the camera; by default the instrument of an earlier combination, else "camera".
     workers : int, optional
@@ -355,6 +356,11 @@ def combine_nights(
         Naming the night: of another detector or degree, of a camera of several detectors, with exposures that were
         given before.
 
+    Warns
+    -----
+    AssumptionWarning
+        For maps without a width that do not scatter at a degree.
+
     See Also
     --------
     legdistort.difference : Whether an old map is still right.
@@ -368,12 +374,14 @@ def combine_nights(
     >>> camera.prior()
     <Prior: degree 2, 6 modes an axis, static_sigma given>
     """
-    given = [results] if isinstance(results, (str, Path, Solution, CombinedNights)) else list(results)
+    given = [results] if isinstance(results, (str, Path, Solution, CombinedNights, Prior)) else list(results)
     if not given:
         raise InputError("no nights: give solutions, folders with one, or an earlier combination")
     earlier, solved = [], []
-    for count, thing in enumerate(map(_opened, given), 1):
-        label = str(thing) if isinstance(thing, Path) else f"solution {count}"
+    for count, each in enumerate(given, 1):
+        thing = _opened(each)
+        kind = "map" if isinstance(thing, Prior) else "solution"
+        label = str(each) if isinstance(each, (str, Path)) else f"{kind} {count}"
         (earlier if isinstance(thing, CombinedNights) else solved).append((label, thing))
     nights = [night for _, each in earlier for night in each.nights]
     shapes = {each.shape for _, each in earlier}
@@ -382,16 +390,35 @@ def combine_nights(
     check_nights(nights, shapes | {shape for _, shape in made})
     name = name or (earlier[0][1].name if earlier else "camera")
     shape = next(iter(shapes | {shape for _, shape in made}))
-    return _combined(nights, shape, name)
+    found = _combined(nights, shape, name)
+    if not earlier and len(solved) > 1:
+        _warn_of_one_map([thing for _, thing in solved], found.scatter)
+    return found
+
+
+def _warn_of_one_map(things, scatter):
+    """Warn where maps that state no errors do not scatter either."""
+    same = [str(degree) for degree, size in enumerate(scatter, 1) if size < EXACT]
+    if same and all(isinstance(each, Prior) and each.static_sigma is None for each in things):
+        warn(
+            f"the maps are the same to {EXACT} px at degree {', '.join(same)}: one fit that they have in common, or "
+            "none, and they do not tell how wrong it is; state a static_sigma (--static-sigma), and no higher degree "
+            "than was fitted",
+            AssumptionWarning,
+        )
 
 
 def _opened(thing):
-    """A solution or combination as it is; a path to a solution as a path, that to a combination read."""
-    if isinstance(thing, (Solution, CombinedNights)):
+    """A solution, combination or map as it is; a path to a solution as a path, that to a combination or prior read."""
+    if isinstance(thing, (Solution, CombinedNights, Prior)):
         return thing
     if not isinstance(thing, (str, Path)):
-        raise InputError(f"nights are solutions, folders with one, or earlier combinations, got {type(thing).__name__}")
-    return Path(thing) if asdf_files.entry_of(thing, [ROOT]) is None else CombinedNights.read(thing)
+        raise InputError(
+            f"nights are solutions, folders with one, maps, or earlier combinations, got {type(thing).__name__}"
+        )
+    kinds = {ROOT: CombinedNights, "legdistort_prior": Prior}
+    entry = asdf_files.entry_of(thing, kinds)
+    return Path(thing) if entry is None else kinds[entry].read(thing)
 
 
 def _combined(nights, shape, name):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from astropy import units as u
+from scipy import special
 
 from ..cameras.camera import Camera
 from ..exceptions import InputError
@@ -32,6 +33,13 @@ _KEPT = "loss", "motion", "motion_sigma", "motion_epoch", "night_sigma"  # setti
 _MOST = 500  # coefficients from which the scatter of exposures is found
 _HASHES = 8  # positions of an exposure that are kept
 _LARGER = 1.1  # sizes, by which a derivative is taken
+
+
+def chance(chi2, k, dof):
+    """Probability of so large a chi2 of k values, whose variances have some degrees of freedom; 1 for no value."""
+    if not k:
+        return 1.0
+    return float(special.fdtrc(k, dof, chi2 / k) if np.isfinite(dof) else special.chdtrc(k, chi2))
 
 
 def fingerprints(solution):

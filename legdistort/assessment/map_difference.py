@@ -18,12 +18,13 @@ from ..inputs.table_files import records
 from ..plots.difference_plots import plot_difference
 from ..priors.mode_tables import mode_table
 from ..priors.prior import Prior
+from ..priors.storage import open_prior
 from ..results.solution import Solution
 from ..runtime.asdf_files import entry_of
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from .camera_memory import CombinedNights
-from .known_maps import DETERMINED, MEAN_SQUARE, fingerprints, known_map, pointed
+from .known_maps import DETERMINED, MEAN_SQUARE, chance, fingerprints, known_map, pointed
 from .star_difference import StarDifference, compare_stars, shared_exposures
 
 if TYPE_CHECKING:
@@ -231,7 +232,8 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
     >>> ld.difference(old, ld.Prior(old.mean * 1.05)).agrees
     True
     """
-    one, two = _opened(first, degree, "first"), _opened(second, degree, "second")
+    two = _opened(second, degree, "second")
+    one = _opened(first, degree, "first", _shape_of(two[0]))
     shared, stars = _shared(one[0], two[0]), None
     if isinstance(one[0], Solution) and isinstance(two[0], Solution):
         stars = compare_stars(one[0], two[0], shared=bool(shared))
@@ -274,7 +276,7 @@ def _of_maps(one, two):
     pull = inside.T @ values
     chi2 = float(np.sum(pull**2 / (power[determined] + _EXACT**2))) if stated else np.nan
     k, dof = int(determined.sum()), min(one.dof, two.dof)
-    p = (float(special.fdtrc(k, dof, chi2 / k)) if np.isfinite(dof) else float(special.chdtrc(k, chi2))) if k else 1.0
+    p = chance(chi2, k, dof)
     errors = np.einsum("ik,k,jk->ij", inside, power[determined], inside)
     found, own = _by_detector(inside @ pull, errors if stated else None, inside, rows, [pair[0] for pair in pairs])
     shapes = {mine: one.shapes[mine] or two.shapes[theirs] for mine, theirs in pairs}
@@ -301,12 +303,23 @@ def _measured(thing):
     return {each.name: each.exposures for each in thing.nights} if isinstance(thing, CombinedNights) else {}
 
 
-def _opened(thing, degree, argument):
-    """A solution, nights, a camera or a prior, and its label."""
+def _shape_of(thing):
+    """That of the only detector of what was opened; None for several, or where it is not stated."""
+    if isinstance(thing, (Prior, CombinedNights)):
+        return thing.shape
+    shapes = thing.estimate.shapes.values() if isinstance(thing, Solution) else (
+        each.shape for each in thing.detectors.values()
+    )  # fmt: skip
+    shapes = set(shapes)
+    return shapes.pop() if len(shapes) == 1 else None
+
+
+def _opened(thing, degree, argument, usual_shape=None):
+    """A solution, nights, a camera or a prior, and its label; of a map that states no shape this is the usual one."""
     label = f"the {argument} map"
     if isinstance(thing, (str, Path)) or (isinstance(thing, (list, tuple)) and len(thing) == 2):
         label = str(thing) if isinstance(thing, (str, Path)) else f"{thing[0]}, {thing[1]}"
-        thing = _read(thing, degree)
+        thing = _read(thing, degree, usual_shape)
     if isinstance(thing, Mapping):
         raise InputError(f"{label} is a dict: compare its maps one by one, or give a Camera")
     if not isinstance(thing, (Solution, CombinedNights, Camera, Prior)):
@@ -316,7 +329,7 @@ def _opened(thing, degree, argument):
     return thing, label
 
 
-def _read(where, degree):
+def _read(where, degree, usual_shape):
     """The nights, camera, solution or prior in files."""
     if isinstance(where, (str, Path)):
         path = Path(where)
@@ -326,7 +339,7 @@ def _read(where, degree):
         kinds |= {"legdistort": Solution, "legdistort_prior": Prior}
         if (entry := entry_of(path, kinds)) is not None:
             return kinds[entry].read(path)
-    return Prior.from_file(where, degree=degree)
+    return open_prior(where, Prior, degree=degree, usual_shape=usual_shape)
 
 
 def _by_detector(values, covariance, inside, rows, keys):

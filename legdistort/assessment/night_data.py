@@ -8,16 +8,20 @@ import numpy as np
 from astropy import units as u
 
 from ..exceptions import InputError
-from ..geometry import basis
+from ..geometry import basis, detector_modes
 from ..inputs import column_contract
+from ..priors.prior import Prior
 from ..results.solution import Solution
 from ..runtime.trees.facts import array, number
-from .known_maps import fingerprints, shown_by, sound
+from .known_maps import fingerprints, pointed, shown_by, sound
+
+#: Error of a coefficient [pix] of a map that states none: that of a header as `legdistort attach` writes it.
+EXACT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Night:
-    """What the exposures of a night say of the static distortion of their detector, and nothing else.
+    """What the exposures of a night, or a map, say of the static distortion of their detector, and nothing else.
 
     ``-2 ln L = z' information z - 2 pull' z`` for a step z from the map `around`, in the order of
     `legdistort.geometry.detector_modes.dynamic_basis`: stars, departures of exposures and a common map of the plane are
@@ -60,7 +64,7 @@ class Night:
     n_nights: int = field(metadata=number(minimum=1))
     scatter: np.ndarray = field(metadata=array("n_degrees", unit="pix", minimum=0))
     nightly: np.ndarray | None = field(metadata=array("n_degrees", unit="pix", minimum=0))
-    dof: float = field(metadata=number(minimum=0))
+    dof: float = field(metadata=number(minimum=0, infinite=True))
     odd: tuple[str, ...] = ()
     exposures: tuple[str, ...] = ()
 
@@ -78,10 +82,29 @@ class Night:
         marks = tuple(mark for each in solution.names if each in used for mark in measured[each])
         return cls(name, date=date, odd=odd, exposures=marks, **counts, **given)
 
+    @classmethod
+    def of_map(cls, prior: Prior, name: str) -> Night:
+        """That of a map, known to its `static_sigma`, or else to 0.001 px a coefficient; it counts as one exposure."""
+        if not prior.states_mean or prior.degree == 0:
+            raise InputError(f"{name} states no distortion: leave it out")
+        if prior.shape is None:
+            raise InputError(f"{name} does not state the shape of its detector: give it shape=")
+        if prior.table is not None:
+            raise InputError(f"{name} has a table beside its series, which cannot be combined: make it of headers")
+        degree, rows = prior.degree, detector_modes.dynamic_basis(prior.shape, prior.mean.shape[1])
+        variances = detector_modes.row_variances(rows, prior.static_widths(degree).ravel())
+        return cls(
+            name, date=None, n_exposures=1, n_stars=0, around=pointed(prior.mean, prior.shape), n_nights=1,
+            information=np.diag(1 / (variances + EXACT**2)), pull=np.zeros(len(rows)), scatter=np.zeros(degree),
+            nightly=None, dof=np.inf,
+        )  # fmt: skip
+
 
 def night_of(item):
-    """The night of a labelled solution or path, and the shape of its detector."""
+    """The night of a labelled solution, map or path, and the shape of its detector."""
     label, thing = item
+    if isinstance(thing, Prior):
+        return Night.of_map(thing, label), thing.shape
     solution = thing if isinstance(thing, Solution) else Solution.read(thing)
     if solution.camera.has_focal_plane:
         raise InputError(f"{label} is of camera {solution.camera.name} with several detectors: solve them one by one")

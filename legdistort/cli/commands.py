@@ -11,7 +11,6 @@ from pathlib import Path
 
 import legdistort
 
-from ..coaddition.grids import given_grid, read_grid
 from ..coaddition.mosaic import check_ending
 from ..coaddition.options import CoaddOptions
 from ..exceptions import InputError
@@ -28,7 +27,18 @@ from ..solving.choices.degree_choice import AUTO, HIGHEST
 from ..solving.options import DEGREE
 from . import options
 from .arguments import flagged, given, lines_of_images, wants_progress
-from .given_files import given_camera, known_file, read_given, read_matches, refuse, sized_term
+from .given_files import (
+    given_camera,
+    given_prior,
+    grid_in,
+    known_file,
+    read_given,
+    read_matches,
+    read_prior,
+    refuse,
+    sized_term,
+    without_options_of_prior,
+)
 from .repeating import repeatable
 
 #: What belongs to a reference.
@@ -72,7 +82,7 @@ def do_run(a):
     measuring, matching, solving = (
         given(a, options.MEASURING),
         given(a, options.MATCHING),
-        _solving(a, with_headers=True),
+        _solving(a),
     )
     own = ("psf", "degree", "prior", "clip", "min_exposures", "reference", "pixel_scale", *_TYING)
     with pipeline.called_by(a.begun, repeatable(a)):
@@ -206,7 +216,7 @@ def do_solve(a):
         check_results(a.out, a.overwrite)  # again: nobody else writes there any more
         matches, inputs = read_matches(a)
         with timed({}, "solve"):
-            solution = legdistort.solve(matches, **_solving(a, a.shape), progress=wants_progress(a))
+            solution = legdistort.solve(matches, **_solving(a, matches), progress=wants_progress(a))
         solution = provenance.with_inputs(solution, inputs)
         with timed({}, "assess"):
             summary = summarise(solution)
@@ -221,7 +231,7 @@ def do_solve(a):
 
 def do_prior(a):
     """``legdistort prior``."""
-    prior = legdistort.Prior.from_file(**given(a, options.EXPANDING))
+    prior, of_several = given_prior(a)
     prior.write(a.out, overwrite=a.overwrite)
     rms_x, rms_y = rms = prior.rms.tolist()
     figures = {
@@ -232,7 +242,7 @@ def do_prior(a):
     }  # fmt: skip
     words = f"degree {prior.degree}{' and a table' * (prior.table is not None)}, truncation error"
     words += f" {prior.truncation:.2g} px; the distortion is {rms_x:.3g} px rms in x, {rms_y:.3g} in y"
-    _say(a, f"{words}; {a.out}", figures)
+    _say(a, "; ".join(filter(None, [words, of_several, str(a.out)])), figures)
 
 
 def do_coadd(a):
@@ -240,7 +250,7 @@ def do_coadd(a):
     check_ending(a.out)
     _refuse_drops(a)
     solution = _solution(a)
-    coadding = {"method": "clipped"} | given(a, options.COADDING) | {"grid": _grid(a.grid, solution)}
+    coadding = {"method": "clipped"} | given(a, options.COADDING) | {"grid": grid_in(a.grid, solution)}
     CoaddOptions(**coadding)  # which refuses them before a frame is read
     mosaic = legdistort.coadd(_open(a), solution, **coadding, **_share(a))
     mosaic.write(a.out, overwrite=a.overwrite)
@@ -298,7 +308,7 @@ def do_predict(a):
     """``legdistort predict``."""
     from ..simulation.prediction_text import describe_plans
 
-    keywords = given(a, options.PREDICTING) | {"prior": _prior(a.prior, a.shape, a.static_sigma)}
+    keywords = given(a, options.PREDICTING) | {"prior": read_prior(a)}
     keywords.pop("static_sigma", None)
     if a.stars is not None:
         keywords["stars"] = read_given(a.stars, a)
@@ -370,7 +380,8 @@ def do_nights(a):
 
 def do_difference(a):
     """``legdistort difference``."""
-    found = legdistort.difference(a.first, a.second, **given(a, options.COMPARED))
+    with without_options_of_prior(a):
+        found = legdistort.difference(a.first, a.second, **given(a, options.COMPARED))
     _draw(found, a)
     _say(a, found, found.to_dict())
     return 3 if a.strict and found.agrees is False else 0
@@ -466,30 +477,22 @@ def _open(a, **reading):
     return legdistort.open_exposures(**given(a, options.FRAMES, options.FLAGGED), **reading, progress=wants_progress(a))
 
 
-def _solving(a, shape=None, *, with_headers=False):
-    """The arguments of `solve`; the prior read, no static distortion if there is none, with the widths asked for."""
+def _solving(a, matches=None):
+    """The arguments of `solve`; the prior read, no static distortion if there is none, with the widths asked for.
+
+    Without `matches`, of which the shape of the detector is known, those of `run`, which has the headers of its frames.
+    """
     keywords = given(a, options.SOLVING)
     static_sigma = keywords.pop("static_sigma", None)
     sigma = keywords.pop("prior_sigma", None)
-    if with_headers and a.prior == HEADER:
+    if matches is None and a.prior == HEADER:
         return keywords | {"prior": HeaderPrior(sigma, static_sigma)}
-    prior = _prior(a.prior, shape, static_sigma)
+    shapes = set() if matches is None else set(matches.shapes.values())
+    prior = read_prior(a, usual_shape=shapes.pop() if len(shapes) == 1 else None)
     if sigma is not None:
         degree = 0 if sigma == EVIDENCE else HIGHEST if a.degree == AUTO else keywords.get("degree", DEGREE)
         prior = (prior or legdistort.Prior([[0.0], [0.0]], source=UNSTATED)).with_sigma(sigma, degree=degree)
     return keywords | {"prior": prior}
-
-
-def _prior(text, shape, static_sigma):
-    """Whatever `Prior.from_file` recognises; without a text, a distortion of which only the size is known."""
-    if text == HEADER and not Path(text).exists():
-        raise InputError(
-            "--prior header is for run, which reads frames: write the distortion of one of them with legdistort prior "
-            "FRAME --out prior.asdf, and give --prior prior.asdf; --static fit finds those of several detectors"
-        )
-    if text is None:
-        return None if static_sigma is None else legdistort.Prior(None, static_sigma=static_sigma)
-    return legdistort.Prior.from_file(text, shape=shape, static_sigma=static_sigma)
 
 
 def _parts(table):
@@ -509,18 +512,6 @@ def _measured_with(tables):
 
 def _solution(a):
     return legdistort.Solution.read(a.solution, max_bytes=a.max_bytes)
-
-
-def _grid(path, solution):
-    """The grid of a file, known to be one for the solution before any frame is read."""
-    if path is None:
-        return None
-    grid = read_grid(path)
-    try:
-        given_grid(grid, solution.sky)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    return grid
 
 
 def _draw(result, a):

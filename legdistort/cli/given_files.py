@@ -1,15 +1,25 @@
-"""What is given on the command line: tables, cameras, matched positions of one field or several, sized terms."""
+"""What is given on the command line: tables, cameras, priors, grids, matched positions, sized terms."""
 
+import re
+from contextlib import contextmanager
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 import legdistort
 
+from ..assessment.night_data import EXACT
+from ..coaddition.grids import given_grid, read_grid
 from ..exceptions import InputError, some_of
 from ..inputs import column_contract
 from ..inputs.table_files import read_table
+from ..priors.from_files import no_map
+from ..priors.prior import HEADER
+from ..priors.storage import open_prior
 from ..runtime.asdf_files import entry_of
 from ..solving.checks.limits import ASKED
+from .arguments import given
+from .options import EXPANDING
 
 
 def refuse(given, reason):
@@ -80,6 +90,93 @@ def _without(matches, patterns):
 
 def _like(pattern, names):
     return [name for name in names if fnmatchcase(str(name), pattern)]
+
+
+@contextmanager
+def without_options_of_prior(a):
+    """A block that reads a prior; if it asks for an option that the command has not, `prior` is said to have it."""
+    try:
+        yield
+    except InputError as error:
+        asked = set(re.findall(r"\(--(\w+)", str(error))) & set(EXPANDING)
+        if all(name in a for name in asked):
+            raise
+        raise InputError(f"{error}; legdistort prior has that option, and what it writes can be given here") from None
+
+
+def read_prior(a, usual_shape=None):
+    """The `Prior` of ``--prior``, as `Prior.from_file`; without that, a distortion of which only the size is known."""
+    text, known = a.prior, {"shape": getattr(a, "shape", None), "static_sigma": a.static_sigma}
+    if text == HEADER and not Path(text).exists():
+        raise InputError(
+            "--prior header is for run, which reads frames: write the distortion of one of them with legdistort prior "
+            "FRAME --out prior.asdf, and give --prior prior.asdf; --static fit finds those of several detectors"
+        )
+    if text is None:
+        return None if a.static_sigma is None else legdistort.Prior(None, static_sigma=a.static_sigma)
+    with without_options_of_prior(a):
+        return open_prior(text, legdistort.Prior, **known, usual_shape=usual_shape)
+
+
+def given_prior(a):
+    """The `Prior` of the sources of a command line, and how it was made, in words.
+
+    One source, or maps of shifts, make it by themselves. Of several, such as headers of one camera, it is the mean,
+    with their scatter as its width (`legdistort.combine_nights`).
+    """
+    asked = given(a, EXPANDING)
+    paths = asked["where"]
+    if len(paths) == 1 or (not any(map(_is_solved, paths)) and no_map(paths) is None):
+        return legdistort.Prior.from_file(**asked), ""
+    if len({Path(path).resolve() for path in paths}) < len(paths):
+        raise InputError("a source stands twice on the command line: it would count twice")
+    if solved := [path for path in paths if _is_solved(path)]:
+        raise InputError(
+            f"{solved[0]} is a solution, or of nights: legdistort nights combines such ones, with priors too, and the "
+            "camera file that it writes is a prior"
+        )
+    each = [legdistort.Prior.from_file(**asked | {"where": path}) for path in paths]
+    found = legdistort.combine_nights(each)
+    made = found.prior()
+    files = {name: checksum for prior in each for name, checksum in _files_of(prior).items()}
+    record = made.source | {"kind": "several", "name": ", ".join(paths), "files": files}
+    widths = {name: asked[name] for name in ("sigma", "static_sigma") if name in asked}
+    made = replace(made, source=record, truncation=max(prior.truncation for prior in each), **widths)
+    words = f"mean of {len(each)} sources"
+    return made, words if a.static_sigma is not None else f"{words}; {_said_of_scatter(found.scatter, len(each))}"
+
+
+def _is_solved(path):
+    """Whether a path leads to a solution or to combined nights, which say more than a map."""
+    return Path(path).is_dir() or entry_of(path, ["legdistort", "legdistort_nights"]) is not None
+
+
+def _files_of(prior):
+    return prior.source.get("files", {}) if isinstance(prior.source, dict) else {}
+
+
+def _said_of_scatter(scatter, n):
+    """The scatter of n sources, by degree from 1, and how well they tell it: that of Gaussian deviates."""
+    count = [2 if degree == 1 else 2 * (degree + 1) for degree in range(1, len(scatter) + 1)]
+    errors = [size / (2 * (n - 1) * k) ** 0.5 for size, k in zip(scatter, count, strict=True)]
+    sizes = ", ".join(
+        f"{size:.2g} +- {error:.1g}" if size >= EXACT else f"below {EXACT}"
+        for size, error in zip(scatter, errors, strict=True)
+    )
+    degrees = "degree 1, 2, ..." if len(scatter) > 1 else "degree 1"
+    return f"static_sigma is their scatter, {sizes} px a coefficient at {degrees}, with the error of the mean"
+
+
+def grid_in(path, solution):
+    """The grid in a file, or None, known to be one for the solution before any frame is read."""
+    if path is None:
+        return None
+    grid = read_grid(path)
+    try:
+        given_grid(grid, solution.sky)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return grid
 
 
 def known_file(path):

@@ -135,7 +135,7 @@ MAPS = {
 COMPARED = {"degree": Option("of the series for a map that is none yet (default 5)", type=int)}
 NIGHTS = {
     "results": Option(
-        "solutions of nights or fields, folders with one, and camera files that this command wrote before",
+        "solutions of nights or fields, folders with one, priors, and camera files that this command wrote before",
         "results",
         nargs="+",
         metavar="RESULTS",
@@ -356,7 +356,8 @@ LAST_STEP = {
 }
 EXPANDING = {
     "where": Option(
-        "a file or name, or the two maps of shifts in x and y, and perhaps two of their errors",
+        "a file or name; the two maps of shifts in x and y, and perhaps two of their errors; or several headers of one "
+        "camera",
         "sources",
         nargs="+",
         metavar="SOURCE",

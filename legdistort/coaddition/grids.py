@@ -12,6 +12,7 @@ from astropy.wcs import WCS
 from ..exceptions import InputError, without_astropy_warnings
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs.file_images import plane_shape
+from ..inputs.frames.header_texts import headers_of, read_text
 from ..inputs.sky_wcs import image_wcs
 from ..runtime.checks import check_is_file
 from ..runtime.fits_bytes import open_fits
@@ -208,8 +209,7 @@ def _of_image(path):
 
 
 def _of_text(path):
-    text = path.read_text(encoding="ascii", errors="ignore")  # SCAMP writes other letters into comments
-    header = fits.Header.fromstring(re.split(r"^END *$", text, maxsplit=1, flags=re.MULTILINE)[0], sep="\n")
-    if "CTYPE1" not in header:
+    headers = headers_of(read_text(path))
+    if not headers or "CTYPE1" not in headers[0]:
         raise InputError("it is not FITS, and as the text of a header it has no CTYPE1")
-    return WCS(header)
+    return WCS(headers[0])

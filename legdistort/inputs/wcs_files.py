@@ -9,6 +9,7 @@ from .detector_files import with_detectors
 from .exposure_files import ExposureFile, expand_paths, open_exposures
 from .exposure_names import exposure_name
 from .foreign_images import header_of_meta
+from .frames.header_texts import TEXTS
 from .sky_wcs import believable_wcs
 
 #: Where files have the gwcs of their image: data models of JWST, those of Roman, and what gwcs and asdf write.
@@ -54,6 +55,8 @@ def open_wcs(paths, *, ext=None, shape=None):
 def _tree(source):
     """The tree of an ASDF file without an image; None for any other source."""
     path = Path(source) if isinstance(source, (str, Path)) else None
+    if path is not None and path.suffix.lower() in TEXTS:
+        raise InputError(f"{path} is the text of a header, without the size and time of its image: give the frame")
     if path is None or path.suffix.lower() != ".asdf":
         return None
     tree = read_tree(path, tags=ARCHIVES)

@@ -13,6 +13,7 @@ def plot_memory(combined, *, fig=None):
     """Every coefficient of the static distortion against time: of single nights, and of all with its error.
 
     Of degree 1 the shears; errors of nights hold what nights scatter by, and those are left out that hardly tell.
+    Nights of which one has no date stand side by side.
 
     Parameters
     ----------
@@ -24,11 +25,12 @@ def plot_memory(combined, *, fig=None):
     fig = elements.new_figure(fig, (8.5, 0.6 + 1.15 * len(i)))
     panels = fig.subplots(len(i), 2, sharex=True, squeeze=False)
     seen = [combined.seen_by(n) for n in range(len(combined.nights))]
-    dates, bad = combined.dates, set(combined.odd)
+    dates, bad, dated = combined.dates, set(combined.odd), combined.dates.any()
+    dates = dates if dated else np.arange(1, len(seen) + 1)
     colours = [elements.RED if each.name in bad else elements.BLUE for each in combined.nights]
     margin = 0.05 * np.ptp(dates) or 0.5
     fine = np.linspace(dates.min() - margin, dates.max() + margin, _FINE if combined.drifts else 2)
-    curve = [combined.static(each) for each in fine]
+    curve = [combined.static(each if dated else None) for each in fine]
     for axis, column in enumerate(panels.T):
         for m, ax in enumerate(column, 1):
             mean = np.array([each[axis, m] for each, _ in curve])
@@ -42,7 +44,7 @@ def plot_memory(combined, *, fig=None):
             ax.set_ylabel(f"L{i[m - 1]} L{j[m - 1]}", fontsize="small")
             ax.tick_params(labelsize="small")
         elements.set_title(column[0], f"along {'xy'[axis]} [pix]")
-        column[-1].set_xlabel("year")
+        column[-1].set_xlabel("year" if dated else "night")
         column[-1].ticklabel_format(axis="x", useOffset=False)
     fig.align_ylabels()
     return fig

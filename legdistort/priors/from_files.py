@@ -10,7 +10,6 @@ from pathlib import Path
 
 import gwcs
 import numpy as np
-from astropy.io import fits
 from astropy.modeling import Model
 
 from ..cameras.source import of_maps, of_powers
@@ -18,10 +17,11 @@ from ..exceptions import AssumptionWarning, InputError, warn, without_astropy_wa
 from ..geometry import basis
 from ..geometry.gsaoi import GSAOI_SIZE, gsaoi_static
 from ..inputs.exposure_files import read_exposures
+from ..inputs.frames.header_texts import headers_of, is_header, read_text
 from ..inputs.sky_wcs import image_wcs
 from ..runtime.asdf_files import ARCHIVES, read_tree
 from ..runtime.checks import check_is_file
-from ..runtime.fits_bytes import open_fits
+from ..runtime.fits_bytes import looks_like_fits, open_fits
 from ..runtime.words import DIRECTIONS
 from .from_objects import as_source, of_model
 
@@ -59,6 +59,12 @@ def read_source(where, *, ext=None, frame=None):
         Naming the file, if it is not there, damaged, or holds no distortion.
     """
     if isinstance(where, (list, tuple)):
+        if len(where) > 1 and (other := no_map(where)) is not None:
+            raise InputError(
+                f"{other} is no FITS map of shifts, of which two (x, then y) are one source; several headers of one "
+                "camera, or other sources, are read one by one, and legdistort.combine_nights([...]).prior() is their "
+                "mean, with their scatter as its width"
+            )
         if len(where) in (2, 4):
             return _refuse(_read_maps(where, ext), frame=frame)
         if len(where) != 1:
@@ -78,6 +84,17 @@ def read_source(where, *, ext=None, frame=None):
     # files are often a little off the standard; what matters is checked here
     with without_astropy_warnings():
         return _read_file(path, ext, frame)
+
+
+def no_map(paths):
+    """The first of several files that is no FITS image of shifts, but has a distortion of its own; None without one."""
+    for path in paths:
+        if Path(path).exists() and not looks_like_fits(path):
+            return path
+        with contextlib.suppress(InputError):
+            read_source(path)
+            return path
+    return None
 
 
 def _refuse(source, **given):
@@ -231,11 +248,8 @@ def _read_maps(paths, ext):
 
 
 def _read_text(path, ext):
-    try:
-        text = path.read_text(encoding="utf-8", errors="strict")
-    except UnicodeDecodeError:
-        text = path.read_text(encoding="latin-1")
-    if re.search(r"^(CTYPE1|SIMPLE) *=", text, re.MULTILINE):
+    text = read_text(path)
+    if is_header(text):
         return _read_header_text(text, ext, str(path))
     if _POLYNOMIAL.search(text):
         return _refuse(_read_powers(text, str(path)), ext=ext)
@@ -243,14 +257,13 @@ def _read_text(path, ext):
 
 
 def _read_header_text(text, ext, name):
-    """One header, or several as SCAMP writes them, each up to END."""
-    blocks = [block for block in re.split(r"^END *$", text, flags=re.MULTILINE) if block.strip()]
-    if ext is None and len(blocks) > 1:
-        raise InputError(f"{name} holds {len(blocks)} headers: choose one with ext (--ext) 0 ... {len(blocks) - 1}")
-    if not str(ext or 0).isdigit() or int(ext or 0) >= len(blocks):
-        raise InputError(f"{name}: no header {ext!r}; it has {len(blocks)}, counted from 0")
-    header = fits.Header.fromstring(blocks[int(ext or 0)], sep="\n")
-    return _from_header(header, name if len(blocks) == 1 else f"{name}[{ext}]")
+    """One header, or several as SCAMP writes them."""
+    headers = headers_of(text)
+    if ext is None and len(headers) > 1:
+        raise InputError(f"{name} holds {len(headers)} headers: choose one with ext (--ext) 0 ... {len(headers) - 1}")
+    if not str(ext or 0).isdigit() or int(ext or 0) >= len(headers):
+        raise InputError(f"{name}: no header {ext!r}; it has {len(headers)}, counted from 0")
+    return _from_header(headers[int(ext or 0)], name if len(headers) == 1 else f"{name}[{ext}]")
 
 
 def _read_powers(text, name):

@@ -56,8 +56,11 @@ def _from_tree(kind, tree):
     return prior
 
 
-def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=None, **options):
-    """Prior from whatever stands in a file (see `Prior.from_file`)."""
+def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=None, usual_shape=None, **options):
+    """Prior from whatever stands in a file (see `Prior.from_file`).
+
+    Its detector has the `usual_shape`, (ny, nx) or None, where neither the source nor `shape` tells it.
+    """
     if isinstance(where, (list, tuple)) and len(where) == 1:
         where = where[0]
     options = {key: value for key, value in options.items() if value is not None}
@@ -75,6 +78,8 @@ def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=No
     files = [path for path in files if isinstance(path, (str, Path))]
     with provenance.unchanged(*files):
         source = read_source(where, ext=ext, frame=frame)
+        if source.shape is None and usual_shape is not None:
+            options = {"shape": usual_shape} | options
         try:
             return kind.from_model(source, **options, **widths)
         except InputError:

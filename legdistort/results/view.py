@@ -470,9 +470,9 @@ class View(ShownAsPrinted):
 
     @property
     def orientation(self) -> tuple[float, float]:
-        """Position angle of the y axis [deg, north through east] and pixel scale [arcsec] at the centre.
+        """Position angle of the y axis [deg, north through east] and pixel scale [arcsec], those of the pose.
 
-        Those of the pose: without the distortion, whose linear part stays out.
+        Without the distortion: means over the detector. At one place, its centre too, they are those of `wcs` there.
 
         Raises
         ------

@@ -442,8 +442,14 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
     if fit.problem.terms.n:  # positions are those of this epoch, whatever the mean of the exposures is
         epoch = fit.problem.terms.epoch
     epoch = matches.epoch if epoch is None else epoch
-    identified = _identified(fit, reference, epoch, pixel_scale)
-    log.info("%d of the %d stars of %s are in the exposures", len(identified.rows), len(reference), reference.label)
+    there = reference.at(epoch, moving=fit.problem.terms.n > 0)
+    identified = _identified(fit, there, pixel_scale)
+    lost = len(reference) - len(there)
+    why = f"; {lost} are left out: they have no proper motion with errors to take them to {epoch or 0:.2f}"
+    log.info(
+        "%d of the %d stars of %s are in the exposures%s",
+        len(identified.rows), len(reference), reference.label, why * bool(lost),
+    )  # fmt: skip
     of = fit.options
     known = np.all(elimination.inverse_star_blocks(fit.blocks.v)[np.diag(packed(fit.problem.n_star))] > 0, axis=0)
     bent_reference.check_degree(reference, len(identified.rows), fit.problem.degree)
@@ -470,11 +476,11 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
     return replace(fit, matches=replace(matches, sky=identified.sky, epoch=epoch), result=result)
 
 
-def _identified(fit, reference, epoch, pixel_scale):
-    """The stars of a reference at an epoch that a fit has, `legdistort.matching.cross_identification.Identified`."""
+def _identified(fit, reference, pixel_scale):
+    """The stars of a reference that a fit has, `legdistort.matching.cross_identification.Identified`."""
     matches = fit.matches
     return identify(
-        reference.at(epoch, moving=fit.problem.terms.n > 0),
+        reference,
         matches.stars,
         np.where(fit.blocks.v[0] > 0, fit.result.state.positions, np.nan).T,
         flux=_flux(matches),
@@ -500,7 +506,7 @@ def _joined(fit, *, reference, epoch, pixel_scale):
     group[fit.problem.star[fit.used]] = fit.matches.camera.group_of(fit.matches.table[fit.problem.order][fit.used])
     if group.max() < 1 or fit.problem.terms.n or reference.degree:
         return fit
-    found = _identified(fit, reference, fit.matches.epoch if epoch is None else epoch, pixel_scale)
+    found = _identified(fit, reference.at(fit.matches.epoch if epoch is None else epoch), pixel_scale)
     positions, agrees = fit.result.state.positions.T, np.ones(len(found.rows), dtype=bool)
     for g in range(group.max() + 1):  # which are off by as much as this group of detectors
         mine = np.flatnonzero(group[found.rows] == g)

@@ -18,7 +18,7 @@ from astropy.wcs import WCS
 
 from ..exceptions import ExportError, InputError, some_of, without_astropy_warnings
 from ..inputs import detector_files, exposure_files, exposure_names, file_images
-from ..inputs.frames import wcs_cards
+from ..inputs.frames import header_texts, wcs_cards
 from ..inputs.frames.weight_maps import WeightMaps
 from ..inputs.sky_wcs import header_wcs, leads_elsewhere, warn_of_another_field
 from ..inputs.wcs_files import PLACES
@@ -131,6 +131,12 @@ def attach(
     -------
     list of `Attachment`
 
+    Warns
+    -----
+    AssumptionWarning
+        Of texts ``NAME.head`` beside files with new headers, in the place of which SWarp reads these; of headers that
+        lead to another field than the solution.
+
     Raises
     ------
     ExportError
@@ -144,7 +150,7 @@ def attach(
     paths = _files(paths)
     targets = [path.resolve() for path in paths]
     if kind == "head" or not in_place:
-        targets = _targets(paths, None if in_place else Path(out), overwrite, ".head" if kind == "head" else None)
+        targets = _targets(paths, None if in_place else Path(out), overwrite, as_texts=kind == "head")
     plans, images = [], _Images.of(solution)
     for path, target in zip(Bar(paths, desc="attaching", unit="frame", disable=not progress), targets, strict=True):
         plan = _plan(images, path, target, kind=kind, max_error=max_error, ext=ext, overwrite=overwrite)
@@ -168,6 +174,8 @@ def attach(
         )  # fmt: skip
     if not plans:
         raise InputError("none of the frames is part of the solution; give those it was made from")
+    if kind in ("sip", "tpv"):
+        header_texts.warn_of_texts([plan.path if in_place else plan.target for plan in plans])
     with replacing_files([plan.target for plan in plans]) if in_place else _copies(Path(out), overwrite) as writing:
         for plan in plans:
             with writing(plan.target) as file:
@@ -271,11 +279,10 @@ def _copies(out, overwrite):
         yield lambda target: replacing(folder / target.name)
 
 
-def _targets(paths, out, overwrite, ending=None):
-    """Where copies go, or files of another ending: into a folder, or beside the frames."""
+def _targets(paths, out, overwrite, *, as_texts):
+    """Where copies go, or texts of headers: into a folder, or beside the frames."""
     targets = [path.resolve() if out is None else out / path.name for path in paths]
-    if ending is not None:
-        targets = [path.with_name(exposure_names.exposure_name(path) + ending) for path in targets]
+    targets = [header_texts.beside(path) for path in targets] if as_texts else targets
     for i, (path, target) in enumerate(zip(paths, targets, strict=True)):
         if target in targets[:i]:
             raise InputError(
@@ -362,9 +369,8 @@ def _foreign_edits(known, images, spans, raw, path):
 
 def _head(hdulist, of_images):
     """A file ``.head``, a text: the cards of every image, ``{number: Header}``, none for one without a solution."""
-    blocks = [of_images.get(k, fits.Header()) for k, hdu in enumerate(hdulist) if file_images.is_image(hdu)]
-    lines = [[*block.tostring(sep="\n", endcard=False, padding=False).splitlines(), "END"] for block in blocks]
-    return "".join(f"{line.rstrip()}\n" for block in lines for line in block).encode("ascii")
+    images = (k for k, hdu in enumerate(hdulist) if file_images.is_image(hdu))
+    return header_texts.text_of(of_images.get(k, fits.Header()) for k in images).encode("ascii")
 
 
 def _is_elsewhere(view, hdulist, hdu):
@@ -432,9 +438,9 @@ def _readable_cards(written):
     """A header without the cards of no sense, which are none of the WCS."""
     cards = []
     for card in fits.Header.fromstring(written).cards:
-        with contextlib.suppress(fits.VerifyError):
+        with contextlib.suppress(fits.VerifyError, ValueError):  # the latter of letters that FITS does not know
             card.verify("silentfix")
-            cards.append((card.keyword, card.value, card.comment))
+            cards.append(fits.Card(card.keyword, card.value, card.comment))
     return fits.Header(cards)
 
 

@@ -12,7 +12,7 @@ from rolled_night import modes, night
 import legdistort as ld
 from legdistort.assessment.combined_nights import Chain, fitted
 from legdistort.cli import main
-from legdistort.exceptions import InputError
+from legdistort.exceptions import AssumptionWarning, InputError
 
 SHAPE = (SIZE, SIZE)
 ORDERS = np.add.outer(np.arange(4), np.arange(4))
@@ -328,6 +328,68 @@ def test_nights_that_do_not_go_together_are_refused(three, tmp_path):
         ld.combine_nights([3])
     with pytest.raises(InputError, match=r"prior.asdf holds no nights \(no entry 'legdistort_nights'\)"):
         ld.CombinedNights.read(static_prior(1).write(tmp_path / "prior.asdf"))
+
+
+def test_maps_count_as_nights_that_state_all(three, tmp_path):
+    """With their widths: exact ones differ by the scatter alone, what has an infinite width says nothing."""
+    rng, degrees = np.random.default_rng(5), np.repeat(range(4), range(1, 5))
+    shears = np.zeros((6, 2, 10))
+    shears[:, 0, 1] = rng.normal(0, 0.1, 6)
+    shears[:, 1, 2] = -shears[:, 0, 1]
+    maps = [ld.Prior(modes(static(1) + curved(50 + i, 0.03)) + shears[i], shape=SHAPE) for i in range(6)]
+    found = ld.combine_nights(maps)
+    assert "from 6 exposures of 6 nights" in str(found)
+    assert not found.odd
+    each = np.array([one.mean for one in maps])
+    assert_allclose(found.static()[0], each.mean(axis=0), atol=1e-4)
+    for degree in (2, 3):
+        scatter = np.sqrt(np.var(each[:, :, degrees == degree], axis=0, ddof=1).mean())
+        assert_allclose(found.scatter[degree - 1], scatter, rtol=0.02)
+    # one that is known badly in a mode leaves it to the others, one that states nothing of it too
+    for width in (5.0, np.inf):
+        widths = np.full((2, 10), 1e-3)
+        widths[1, 7] = width
+        off = each[0].copy()
+        off[1, 7] += rng.normal(0, 3)
+        weighed = ld.combine_nights([ld.Prior(off, static_sigma=widths, shape=SHAPE), *maps[1:]]).static()[0]
+        assert_allclose(weighed[1, 7], each[1:, 1, 7].mean(), atol=1e-4)
+        assert_allclose(weighed[1, 6], each[:, 1, 6].mean(), atol=1e-4)
+    found.write(tmp_path / "camera.asdf")
+    again = ld.CombinedNights.read(tmp_path / "camera.asdf")
+    assert_array_equal(again.static()[0], found.static()[0])
+    assert again.table["p"].min() > 0.01
+    assert found.plot().axes[-1].get_xlabel() == "night"  # without dates
+    maps[0].write(tmp_path / "map.asdf")
+    mixed = ld.combine_nights([tmp_path / "map.asdf", three[0]])
+    assert sorted(night.n_stars > 0 for night in mixed.nights) == [False, True]
+    assert {night.name for night in mixed.nights} == {str(tmp_path / "map.asdf"), "solution 2"}
+
+
+def test_maps_that_do_not_scatter_are_named():
+    """SCAMP fits one distortion to all exposures: that these are the same says nothing of how wrong they are."""
+    one = ld.Prior(modes(static(1)), shape=SHAPE)
+    shear = np.zeros((2, 10))
+    shear[0, 1], shear[1, 2] = 0.1, -0.1
+    with pytest.warns(AssumptionWarning, match=r"the same to 0.001 px at degree 2, 3: .* state a static_sigma \(--st"):
+        found = ld.combine_nights([one, ld.Prior(one.mean + shear, shape=SHAPE)])
+    assert_allclose(found.scatter[0], 0.1 / np.sqrt(2), rtol=0.01)  # one difference of two shears, one of which is none
+    stated = ld.Prior(one.mean, static_sigma=0.05, shape=SHAPE)
+    assert np.all(ld.combine_nights([stated, stated]).scatter < 0.01)
+    assert not ld.combine_nights(one).scatter.any()
+
+
+@pytest.mark.parametrize(
+    ("made", "words"),
+    [
+        (lambda: ld.Prior(None, static_sigma=2.0), "map 1 states no distortion: leave it out"),
+        (lambda: ld.Prior(None, sigma="evidence"), "map 1 states no distortion"),
+        (lambda: ld.Prior([[0.1], [0.0]], shape=SHAPE), "map 1 states no distortion"),
+        (lambda: ld.Prior(modes(static(1))), "map 1 does not state the shape of its detector: give it shape="),
+    ],
+)
+def test_maps_that_say_nothing_are_refused(made, words):
+    with pytest.raises(InputError, match=words):
+        ld.combine_nights([made(), ld.Prior(modes(static(1)), shape=SHAPE)])
 
 
 def test_the_command(three, tmp_path, capsys):

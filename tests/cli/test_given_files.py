@@ -5,7 +5,9 @@ import re
 
 import numpy as np
 import pytest
+from astropy.table import QTable
 from night_sets import SIZE, Nights
+from scamp_heads import barrel, matrix, write_head
 
 import legdistort as ld
 from legdistort.cli import main
@@ -116,3 +118,25 @@ def test_cameras_and_priors_are_shown(tmp_path, capsys):
     assert [each["id"] for each in json.loads(capsys.readouterr().out)["detectors"]] == ["1", "2", "3", "4"]
     assert main(["show", str(tmp_path / "camera.asdf"), "--strict"]) == 1
     assert "--strict is for a solution: leave it out" in capsys.readouterr().err
+
+
+def test_the_shape_of_a_header_comes_from_what_it_is_used_with(table, tmp_path, capsys):
+    """A text states none: the table of matches does, and the solution that it is compared with."""
+    head = write_head(tmp_path / "a.head", barrel(120), cd=matrix(scale=0.01 / 3600), crpix=(1024.5, 1024.5))
+    matched = QTable.read(table)
+    matched.meta["shapes"] = {name: [2048, 2048] for name in set(matched["exposure"].tolist())}
+    matched.write(tmp_path / "stated.ecsv")
+    out = str(tmp_path / "out")
+    line = ["solve", str(tmp_path / "stated.ecsv"), "--degree", "2", "--quiet", "--prior", str(head), "--out"]
+    assert main([*line, out]) == 0
+    prior = ld.Solution.read(out).settings.prior
+    assert prior["shape"] == [2048, 2048]
+    assert prior["truncation_px"] == ld.Prior.from_file(head, shape=(2048, 2048)).truncation
+    assert main(["difference", str(head), out]) in (0, 3)
+    capsys.readouterr()
+    for words in (["difference", str(head), str(head)], ["run", str(table), "--prior", str(head)]):
+        assert main([*words, *["--out", str(tmp_path / "r")] * (words[0] == "run")]) == 1
+        told = capsys.readouterr().err
+        assert "give --shape NY NX; legdistort prior has that option, and what it writes can be given here" in told
+    assert main(["predict", "--prior", str(head), "--n-exposures", "4", "--n-stars", "30", "--sigma", "0.02"]) == 1
+    assert capsys.readouterr().err.endswith("give --shape NY NX\n")

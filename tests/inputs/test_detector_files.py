@@ -14,6 +14,7 @@ from astropy.io import fits
 from astropy.modeling import models
 from astropy.table import QTable
 from gwcs import coordinate_frames as cf
+from scamp_heads import write_head
 
 import legdistort
 from legdistort import Exposure, Solution
@@ -257,8 +258,13 @@ def test_foreign_files_with_a_gwcs_alone(shared_data):
         ),
         (lambda path: _frame(path), (N, N), r"--shape comes from the frames of --wcs: leave it out"),
         (lambda path: _twice(path), (N, N), "two frames are named a_wcs: give one of them"),
+        (
+            lambda path: write_head(path.with_suffix(".head")),
+            None,
+            r"a_wcs.head is the text of a header, without the size and time of its image: give the frame",
+        ),
     ],
-    ids=["no shape", "no gwcs", "no gwcs file", "twice"],
+    ids=["no shape", "no gwcs", "no gwcs file", "twice", "text of a header"],
 )
 def test_files_of_no_use_are_named(make, shape, words, tmp_path):
     wcs = nominal_wcs("NRCA1", [0, 0])

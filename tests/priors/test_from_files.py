@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import sys
 import warnings
 
@@ -20,7 +21,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import polynomial
 from numpy.testing import assert_allclose, assert_array_equal
+from scamp_heads import barrel, matrix, to_plane, to_sky, write_head
 
+from legdistort.assessment.camera_memory import combine_nights
 from legdistort.cameras.source import Source
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortError
@@ -461,6 +464,99 @@ def test_choice_among_headers(tmp_path):
         read_source(tmp_path / "m.head")
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_headers_of_scamp(tmp_path, encoding):
+    """Whose comments have letters that FITS does not know, and whose TAN with PV is a TPV."""
+    path = write_head(tmp_path / "a.head", encoding=encoding)
+    prior = Prior.from_file(path, shape=(1024, 1024))
+
+    def plane(x, y):
+        return touching(to_sky(to_plane(x, y)), to_sky(to_plane(511.5, 511.5)))
+
+    assert distance(prior, plane) < max(1e-6, 1.01 * prior.truncation) < 1e-3
+    assert min(prior.rms) > 0.3
+    plain = tmp_path / "b.head"
+    plain.write_text(path.read_text(encoding).replace("é", "e"))
+    assert_array_equal(Prior.from_file(plain, shape=(1024, 1024)).mean, prior.mean)
+    assert main(["prior", str(path), "--shape", "1024", "1024", "--out", str(tmp_path / "p.asdf"), "--quiet"]) == 0
+    assert_allclose(Prior.read(tmp_path / "p.asdf").mean, prior.mean)
+
+
+def _three_heads(tmp_path):
+    """Barrels of a camera that was pointed, turned, mirrored and refocused: as each states it, and their files."""
+    poses = {"sky": (266.4, -28.9)}, {"cd": matrix(40)}, {"cd": matrix(200, 0.035001 / 3600, False)}
+    return [
+        write_head(tmp_path / f"{k}.head", barrel(strength), **pose)
+        for k, (strength, pose) in enumerate(zip((120, 126, 123), poses, strict=True))
+    ]
+
+
+def test_several_headers_of_a_camera(tmp_path, capsys, recwarn):
+    """Their mean, and what the next one may be off by: the scatter that the textbook has of a degree."""
+    heads, shape = _three_heads(tmp_path), (1024, 1024)
+    each = np.array([Prior.from_file(head, shape=shape, degree=3).mean for head in heads])
+    degrees = np.add(*basis.orders(3))
+    out = tmp_path / "prior.asdf"
+    line = ["prior", *map(str, heads), "--shape", "1024", "1024", "--degree", "3", "--out", str(out)]
+    assert main(line) == 0
+    told, found = capsys.readouterr(), Prior.read(out)
+    assert "mean of 3 sources; static_sigma is their scatter, below 0.001, below 0.001, 0.0" in told.out
+    assert "the maps are the same to 0.001 px at degree 1, 2: one fit that they have in common, or none" in told.err
+    assert_allclose(found.mean, each.mean(axis=0), rtol=0, atol=1e-7)
+    assert found.shape == shape
+    assert sorted(found.source["files"]) == ["0.head", "1.head", "2.head"]
+    cubic = each[:, :, degrees == 3]
+    scatter = np.sqrt(np.var(cubic, axis=0, ddof=1).mean())
+    assert scatter > 0.005
+    # with the error of the mean, and 0.001 px for that of a header
+    assert_allclose(found.static_sigma[:, degrees == 3], scatter * np.sqrt(4 / 3), rtol=0.02)
+    assert np.all(found.static_sigma[:, degrees == 2] < 1e-3)
+    of_python = combine_nights([Prior.from_file(head, shape=shape, degree=3) for head in heads]).prior()
+    assert_array_equal(of_python.static_sigma, found.static_sigma)
+    recwarn.clear()
+    assert main([*line, "--static-sigma", "0.2", "--sigma", "0.1", "--overwrite", "--json"]) == 0
+    told = capsys.readouterr()
+    assert "the same to" not in told.err
+    assert json.loads(told.out)["source"]["nights"] == 3
+    assert set(Prior.read(out).static_sigma.ravel()) == {0.2}
+    assert set(Prior.read(out).sigma.ravel()) == {0.1}
+
+
+def test_several_images_with_a_distortion_are_no_maps(tmp_path):
+    for k, power in enumerate((1e-4, 1.2e-4)):
+        header = sip_header()
+        header["A_2_0"] = power
+        fits.PrimaryHDU(np.zeros((256, 256)), header).writeto(tmp_path / f"{k}.fits")
+    names = [str(tmp_path / f"{k}.fits") for k in (0, 1)]
+    assert main(["prior", *names, "--out", str(tmp_path / "p.asdf"), "--degree", "3", "--quiet"]) == 0
+    assert Prior.read(tmp_path / "p.asdf").static_sigma.max() > 0.05
+    with pytest.raises(InputError, match=r"0.fits is no FITS map of shifts.* several headers .*combine_nights\(\["):
+        Prior.from_file(names)
+
+
+@pytest.mark.parametrize(
+    ("names", "more", "message"),
+    [
+        (["0.head", "0.head"], [], "a source stands twice on the command line"),
+        (["0.head", "absent.head"], ["--shape", "99", "99"], "absent.head: no such file"),
+        (["0.head", "1.head"], [], r"0.head \(FITS header, RA---TAN\) does not state the size .* --shape NY NX"),
+        (["0.head", "two.head"], ["--shape", "9", "9"], r"two.head holds 2 headers: choose one with ext"),
+        (
+            ["0.head", "folder"],
+            [],
+            "folder is a solution, or of nights: legdistort nights combines",
+        ),
+    ],
+)
+def test_headers_that_do_not_go_together(tmp_path, capsys, names, more, message):
+    _three_heads(tmp_path)
+    (tmp_path / "folder").mkdir()
+    write_head(tmp_path / "two.head", blocks=2)
+    line = ["prior", *(str(tmp_path / name) for name in names), "--out", str(tmp_path / "p.asdf")]
+    assert main([*line, *more]) == 1
+    assert re.search(message, capsys.readouterr().err)
+
+
 # --- priors in files, and the command -----------------------------------------------------------------------------
 
 
@@ -645,7 +741,11 @@ def bad(tmp_path_factory):
         (["flat.fits", "small.fits"], {}, r"shapes \(20, 30\) \(x\) and \(10, 30\) \(y\); the maps must be"),
         (["flat.fits", "nan.fits"], {}, r"the y map has 1 values that are not finite, the first at pixel x 7, y 4"),
         (["fold.fits", "flat.fits"], {}, r"fold.fits.* folds, or has no width, near pixel \[\d+.0, 0.0\]"),
-        (["flat.fits", "text.txt"], {}, "text.txt: cannot be read as FITS"),
+        (
+            ["flat.fits", "text.txt"],
+            {},
+            r"text.txt is no FITS map of shifts, of which two \(x, then y\) are one source",
+        ),
         (["flat.fits", "flat.fits"], {"ext": "SCI"}, "flat.fits: no extension 'SCI'"),
         (["flat.fits"] * 3, {}, r"two maps \(x, then y\), perhaps with two of their errors \(x, then y\); got 3"),
         (["m_y.fits", "m_x.fits"], {}, "m_x.fits: the map of the shifts in x comes first"),

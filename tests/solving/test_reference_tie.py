@@ -565,6 +565,19 @@ def test_stars_without_motion_serve_at_their_own_epoch_only(night):
         reference.subset(mask[np.arange(len(table)) != 1]).at(2021.0)
 
 
+@pytest.mark.parametrize(("epoch", "n"), [(2021.0, 7), (2016.0, 0)])
+def test_stars_left_out_for_the_want_of_a_motion_are_counted(night, caplog, epoch, n):
+    """With the cause; none are at the epoch of the catalogue."""
+    table = gaia(night, motion=0.0)
+    for name in ("pmra", "pmdec", "pmra_error", "pmdec_error"):
+        table[name] = MaskedColumn(table[name], mask=np.arange(len(table)) < 7)
+    with caplog.at_level(logging.INFO, logger="legdistort"):
+        solve(night.matches, prior=Prior(night.truth.static), reference=table, epoch=epoch)
+    told = next(line for line in caplog.messages if "of the reference are in the exposures" in line)
+    words = f"; {n} are left out: they have no proper motion with errors to take them to {epoch:.2f}"
+    assert re.fullmatch(rf"\d+ of the {len(table)} stars of the reference are in the exposures{words * (n > 0)}", told)
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_a_file_and_its_command(night, tied, tmp_path, capsys):
     gaia(night).write(tmp_path / "gaia.ecsv")

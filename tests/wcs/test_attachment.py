@@ -20,12 +20,13 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
+from caller_warnings import warns_here
 from numpy.testing import assert_allclose, assert_array_equal
 from sky_chains import detector
 
 import legdistort
 from legdistort.cli.parser import main
-from legdistort.exceptions import DiskFullError, ExportError, InputError
+from legdistort.exceptions import AssumptionWarning, DiskFullError, ExportError, InputError
 from legdistort.geometry import similarity
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.inputs import detector_files
@@ -221,7 +222,14 @@ def test_odd_cards_survive(one, tmp_path):
     write_frame(path, checksum=False)
     raw = path.read_bytes()
     odd = b"".join(
-        c.ljust(80) for c in (b"exptime2=    3.0E+0 / lower case", b"BAD     = 'no end", b"CONTINUE  'alone'")
+        c.ljust(80)
+        for c in (
+            b"exptime2=    3.0E+0 / lower case",
+            b"BAD     = 'no end",
+            b"CONTINUE  'alone'",
+            b"OBSERVER= 'Ren\xe9'",
+            b"COMMENT \xc3\xa0 Paris",
+        )
     )
     place, end = raw.index(b"OBJECT  "), raw.index(b"END     ")
     header = raw[:place] + odd + raw[place : end + 80]
@@ -539,6 +547,27 @@ def test_head_files_of_packed_frames(one, tmp_path):
     (item,) = attach(one, tmp_path / "frame.fits.gz", in_place=True, kind="head")
     assert item.path.name == "frame.head"
     assert repr(item).endswith("px>")
+
+
+@pytest.mark.parametrize("in_place", [True, False])
+def test_old_texts_beside_new_headers_are_named(geometry, tmp_path, in_place):
+    """SWarp would read the old header; nobody is warned of the texts of others, or of those that are written now."""
+    names = [f"f{k}" for k in range(5)]
+    solution = geometry(1, 2.0, shape=SHAPE, names=names)
+    frames = [write_frame(tmp_path / f"{name}.fits") for name in names]
+    where = {"in_place": True} if in_place else {"out": tmp_path / "out", "overwrite": True}
+    folder = tmp_path if in_place else tmp_path / "out"
+    folder.mkdir(exist_ok=True)
+    (folder / "another.head").write_text("END\n")
+    attach(solution, frames, **where)  # any warning is an error
+    for name in names[1:]:
+        (folder / f"{name}.head").write_text("END\n")
+    found = r"beside 4 of the files written stands a text .head \(.*f1.head, .*f3.head and 1 more\), which .*--head"
+    for kind in ("sip", "tpv"):
+        with warns_here(AssumptionWarning, found):
+            attach(solution, frames, kind=kind, **where)
+    attach(solution, frames, kind="head", **where | {"overwrite": True})
+    attach(solution, frames, kind=None, **where)
 
 
 def test_flags_of_two_images_are_left_alone(geometry, tmp_path):

@@ -57,7 +57,8 @@ def stars_check(solution, observed):
     more = f" and {len(odd) - len(found)} more" * (len(odd) > len(found))
     return Check("stars", "warn", len(odd), 0,
                  f"observations of {_counted(len(odd))} contradict each other: {', '.join(found)}{more}",
-                 "look at these; leave out what is no single star, fit what moves (--motion)")  # fmt: skip
+                 "look at these; take the rows of what is no single star out of matched.ecsv, fit what moves "
+                 "(--motion)")  # fmt: skip
 
 
 def _counted(n):
