@@ -407,8 +407,8 @@ class Diagnostics:
         fit; it is part of every distortion. None: nothing was found.
     static_departure : dict or None
         How far static distortions that were fitted depart from those that were given, rms per axis over the detector,
-        pixels: ``{detector: (rms, its error)}``, or ``(rms,)`` where the error is not at hand. None: none was fitted,
-        or none given.
+        pixels: ``{detector: (rms, its error)}``, that of a map that all detectors share aside, or ``(rms,)`` where it
+        is not at hand. None: none was fitted, or none given.
     pointing : HeaderPointing or None
         How well the headers tell where the plane lies on the sky, where they do.
     terms : tuple of FittedTerm
@@ -547,7 +547,8 @@ def _departure_in_words(found):
         known = f" (error {error[0]:.2g} px)" if error else ""
         each.append(f"{rms:.2g} px rms per axis{known}{f' on {name}' if several else ''}")
     which = "distortions depart from those" if several else "distortion departs from the one"
-    return f"the static {which} given by {some_of(each, _MOST_NAMED)}"
+    aside = "; the errors leave out that of a map that all detectors share" * any(len(e) > 1 for _, e in listed)
+    return f"the static {which} given by {some_of(each, _MOST_NAMED)}{aside}"
 
 
 def _in_words(widths):
