@@ -13,6 +13,8 @@ from ..geometry import basis, detector_modes
 from ..geometry.similarity import apply, invert
 from ..matching.matches import Matches
 from ..priors.prior import Prior
+from ..results.errors import absolute_errors
+from ..results.errors.coefficient_covariance import mean_covariance
 from ..results.solution import Solution
 from ..solving import single_fit
 from ..solving.equations.reduced_system import DIRECT_LIMIT
@@ -22,6 +24,7 @@ from ..solving.knowledge.factors import Factor
 from ..solving.knowledge.posterior import Posterior, most_likely
 from ..solving.knowledge.reduced_data import drawn, part_of
 from ..solving.options import SolveOptions
+from ..solving.single_detectors import map_alone
 
 #: A coefficient of 1 px displaces by sqrt(1/8) px rms per axis: b_m has mean square 1/4.
 MEAN_SQUARE = 8
@@ -73,6 +76,8 @@ class KnownMap:
         Degrees of freedom of a covariance that is estimated from the scatter of exposures.
     degree : int or None
         Modes beyond are not known.
+    is_named : bool
+        Whether it is a map of one detector that its file names.
     """
 
     label: str
@@ -81,6 +86,7 @@ class KnownMap:
     covariance: np.ndarray | None = None
     dof: float = np.inf
     degree: int | None = None
+    is_named: bool = False
 
     @property
     def highest(self):
@@ -100,7 +106,9 @@ def known_map(thing, label, other=None):
         return _of_nights(thing, label)
     widths = thing.static_sigma
     covariance = None if widths is None else np.diag(np.minimum(widths.ravel(), _NOTHING) ** 2)
-    return KnownMap(label, {"1": thing.mean}, {"1": thing.shape}, covariance)
+    named = thing.source.get("detector") if isinstance(thing.source, dict) else None
+    key = named or "1"
+    return KnownMap(label, {key: thing.mean}, {key: thing.shape}, covariance, is_named=named is not None)
 
 
 def _of_nights(nights, label):
@@ -113,36 +121,82 @@ def _of_nights(nights, label):
 
 
 def _of_camera(camera, label):
-    statics = {key: each.static for key, each in camera.detectors.items()}
+    """The detectors of a camera, the shear of whose layouts is a part of their maps."""
+    statics = {key: map_alone(each)[1] for key, each in camera.detectors.items()}
     shapes = {key: each.shape for key, each in camera.detectors.items()}
-    widths = [each.static_sigma for each in camera.detectors.values()]
-    covariance = None
+    widths, covariance = [each.static_sigma for each in camera.detectors.values()], None
     if any(each is not None for each in widths):
-        widths = [np.zeros(s.shape) if w is None else w for w, s in zip(widths, statics.values(), strict=True)]
+        widths = [_widths(each, statics[key].shape) for key, each in camera.detectors.items()]
         covariance = np.diag(np.concatenate([np.minimum(each.ravel(), _NOTHING) ** 2 for each in widths]))
     return KnownMap(camera.name if label.startswith("the ") else label, statics, shapes, covariance)
 
 
+def _widths(detector, shape):
+    """Standard deviations (2, n_modes) of the map of a detector."""
+    given = [detector.layout_sigma, detector.static_sigma]
+    layout, static = (
+        np.zeros(shape) if w is None else basis.change_degree(w, basis.degree_of(shape[1])) for w in given
+    )
+    return np.where(np.arange(shape[1]) < 3, np.maximum(layout, static), static)
+
+
 def _of_focal_plane(solution, label):
-    """The detectors of a camera that was fitted: layouts are free, and a common map of the focal plane."""
+    """The detectors of a camera that was fitted, with what its exposures have in common; layouts are free."""
     errors, camera = solution.estimate.uncertainty.camera, solution.camera
     if errors is None or not errors.free[:, :, 3:].any():
         raise InputError(
             f"{label} was solved with the static distortions of camera {camera.name} as given, and says nothing of "
             "them: solve it with static='fit' (--static fit)"
         )
-    known, n = _of_camera(camera, label), errors.free.shape[2]
-    statics = {key: basis.change_degree(each, basis.degree_of(n)) for key, each in known.statics.items()}
-    covariance = np.zeros((errors.free.size, errors.free.size))
-    free = np.flatnonzero(errors.free.ravel())
-    covariance[np.ix_(free, free)] = errors.changes @ errors.changes.T
-    of_layouts = np.zeros(errors.free.shape)
-    of_layouts[:, :, :3] = _NOTHING**2
-    covariance += np.diag(of_layouts.ravel())
+    known = _of_camera(camera, label)
+    n = int(np.flatnonzero(errors.free.any(axis=(0, 1))).max()) + 1  # what is beyond was given, and not asked
+    free = errors.free[:, :, :n]
     common = np.concatenate([_common_maps(camera, each, n) for each in camera.detectors.values()])
-    return replace(
-        known, statics=statics, covariance=covariance + _NOTHING**2 * common @ common.T, degree=basis.degree_of(n)
-    )
+    mean, covariance, shared = _of_exposures(solution, n)
+    moved = common @ shared
+    moved[free.ravel()] += errors.changes
+    unseen = ~free | (np.arange(n) < 3)
+    covariance = common @ covariance @ common.T + moved @ moved.T + np.diag(_NOTHING**2 * unseen.ravel())
+    statics = {key: _whole(camera, each, mean.reshape(2, n)) for key, each in camera.detectors.items()}
+    return replace(known, statics=statics, covariance=covariance, degree=basis.degree_of(n))
+
+
+def _whole(camera, detector, common):
+    """Coefficients (2, n) of all that displaces on a detector, with a `common` distortion (2, n) of the focal plane."""
+    degree, back = basis.degree_of(common.shape[1]), invert(detector.layout)
+
+    def displacement(u, v):
+        q = basis.denormalize(u, v, detector.shape)
+        f = apply(back, q)
+        return (detector.to_pixels(f + (common @ basis.values(degree, *basis.normalize(f, camera.field))).T) - q).T
+
+    return basis.project(displacement, degree)
+
+
+def _of_exposures(solution, n):
+    """What exposures and a reference tell of a common map of the focal plane, in n modes per axis.
+
+    Nothing without a reference: where detectors share a map, exposures can take it over.
+
+    Returns
+    -------
+    mean : ndarray, shape (2 n,)
+    covariance : ndarray, shape (2 n, 2 n)
+    shared : ndarray, shape (2 n, r)
+        Responses to the errors of the camera.
+    """
+    gauge, uncertainty = solution.gauge, solution.estimate.uncertainty
+    shared = uncertainty.camera.coefficients.mean(axis=0)
+    size = len(shared) // 2
+    if gauge.tie is None:
+        return np.zeros(2 * n), _NOTHING**2 * np.eye(2 * n), np.zeros((2 * n, shared.shape[1]))
+    moved = absolute_errors.known_changes(gauge, size).mean(axis=0)
+    unknown = _NOTHING * absolute_errors.unknown_changes(gauge, size).mean(axis=1)
+    covariance = mean_covariance(uncertainty.coefficients, len(solution.names)) + unknown.T @ unknown
+    covariance += moved @ absolute_errors.known_covariance(gauge) @ moved.T
+    rows = np.kron(np.eye(2), np.eye(n, size))
+    mean = solution.coefficients[:, :, :size].mean(axis=0)
+    return rows @ mean.ravel(), rows @ covariance @ rows.T, rows @ shared
 
 
 def _common_maps(camera, detector, n):

@@ -16,6 +16,7 @@ from ..exceptions import InputError, some_of
 from ..geometry import basis, detector_modes
 from ..inputs.table_files import records
 from ..plots.difference_plots import plot_difference
+from ..priors.from_objects import SKY
 from ..priors.mode_tables import mode_table
 from ..priors.prior import Prior
 from ..priors.storage import open_prior
@@ -60,6 +61,8 @@ class MapDifference(ShownAsPrinted):
         Rms of the difference that the errors let expect, per axis, pixels; NaN where none is stated.
     n_undetermined : int
         Directions that are not determined to 0.3 px, rms per axis, and do not count.
+    left_out : tuple of str
+        Detectors that one has alone, where the other is a map of one that its file names.
     shared : tuple of str
         Exposures of the second that the first has too: the errors are not independent then, and the difference has
         neither errors nor a probability.
@@ -78,6 +81,7 @@ class MapDifference(ShownAsPrinted):
     p: float
     rms_error: float = np.nan
     n_undetermined: int = 0
+    left_out: tuple[str, ...] = ()
     shared: tuple[str, ...] = ()
     stars: StarDifference | None = None
     refused: str = ""
@@ -122,6 +126,12 @@ class MapDifference(ShownAsPrinted):
     @property
     def sentence(self) -> str:
         """The result in a sentence."""
+        of = ", ".join(self.shapes)
+        return self._found + f" (detector {of}; without {some_of(list(self.left_out), 6)})" * bool(self.left_out)
+
+    @property
+    def _found(self):
+        """The same but for detectors that are left out."""
         first, second = self.labels
         if self.refused:
             return f"the maps of {first} and {second} are not compared: {self.refused}"
@@ -202,6 +212,10 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
     their scatter, and a common map of the plane is free. Of two solutions the stars are compared too. Where exposures
     are in both, as of a solution with and without a night, errors are not independent, and no probability is given.
 
+    A map of a file that names its detector is compared with that detector of a camera, and two gwcs that end in other
+    frames on the sky. What the detectors of a camera share counts where a reference tied the night, since exposures can
+    take it over.
+
     Parameters
     ----------
     first, second : path, Camera, Prior, Solution, CombinedNights, or anything
@@ -234,6 +248,15 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
     """
     two = _opened(second, degree, "second")
     one = _opened(first, degree, "first", _shape_of(two[0]))
+    if (frames := _ends(one[0], two[0])) is not None:  # what lies between them is a part of one map and not the other
+        on_sky = {"degree": degree, "frame": SKY}
+        try:
+            one, two = _opened(first, argument="first", **on_sky), _opened(second, argument="second", **on_sky)
+        except InputError as error:
+            raise InputError(
+                f"{one[1]} ends in the frame {frames[0]!r}, {two[1]} in {frames[1]!r}, which need not be alike, and "
+                f"not both lead to the sky ({error}): compare priors that were made with one frame (--frame)"
+            ) from None
     shared, stars = _shared(one[0], two[0]), None
     if isinstance(one[0], Solution) and isinstance(two[0], Solution):
         stars = compare_stars(one[0], two[0], shared=bool(shared))
@@ -256,6 +279,7 @@ def _of_maps(one, two):
     if one.label == two.label:
         one, two = replace(one, label=f"{one.label} (first)"), replace(two, label=f"{two.label} (second)")
     pairs = _paired(one, two)
+    left_out = [key for k, each in enumerate((one, two)) for key in each.statics if key not in [p[k] for p in pairs]]
     limits = [each.degree for each in (one, two) if each.degree is not None]
     degree = min(limits) if limits else max(one.highest, two.highest)
     n = basis.n_modes(degree)
@@ -283,8 +307,15 @@ def _of_maps(one, two):
     size = float(np.sqrt(np.sum(power[determined]) / MEAN_SQUARE / len(pairs))) if stated else np.nan
     return MapDifference(
         (one.label, two.label), found, own, shapes, chi2, k if stated else 0, p if stated else np.nan, size,
-        int(np.count_nonzero(~determined)),
+        int(np.count_nonzero(~determined)), left_out=tuple(dict.fromkeys(left_out)),
     )  # fmt: skip
+
+
+def _ends(first, second):
+    """Frames in which the undistorted planes of the maps of two gwcs lie, if these are not the same; else None."""
+    sources = [each.source for each in (first, second) if isinstance(each, Prior) and isinstance(each.source, dict)]
+    frames = [each["frame"] for each in sources if each.get("kind") == "gwcs"]
+    return frames if len(set(frames)) == 2 else None
 
 
 def _shared(first, second):
@@ -314,22 +345,25 @@ def _shape_of(thing):
     return shapes.pop() if len(shapes) == 1 else None
 
 
-def _opened(thing, degree, argument, usual_shape=None):
-    """A solution, nights, a camera or a prior, and its label; of a map that states no shape this is the usual one."""
+def _opened(thing, degree, argument, usual_shape=None, frame=None):
+    """A solution, nights, a camera or a prior, of a gwcs to a frame of it, and its label.
+
+    A map that states no shape has the usual one.
+    """
     label = f"the {argument} map"
     if isinstance(thing, (str, Path)) or (isinstance(thing, (list, tuple)) and len(thing) == 2):
         label = str(thing) if isinstance(thing, (str, Path)) else f"{thing[0]}, {thing[1]}"
-        thing = _read(thing, degree, usual_shape)
+        thing = _read(thing, degree, usual_shape, frame)
     if isinstance(thing, Mapping):
         raise InputError(f"{label} is a dict: compare its maps one by one, or give a Camera")
     if not isinstance(thing, (Solution, CombinedNights, Camera, Prior)):
-        thing = Prior.from_model(thing, degree=degree)
+        thing = Prior.from_model(thing, degree=degree, frame=frame)
     if isinstance(thing, Prior) and thing.mean is None:
         raise InputError(f"{label} states only the size of a distortion: give a map")
     return thing, label
 
 
-def _read(where, degree, usual_shape):
+def _read(where, degree, usual_shape, frame):
     """The nights, camera, solution or prior in files."""
     if isinstance(where, (str, Path)):
         path = Path(where)
@@ -339,7 +373,7 @@ def _read(where, degree, usual_shape):
         kinds |= {"legdistort": Solution, "legdistort_prior": Prior}
         if (entry := entry_of(path, kinds)) is not None:
             return kinds[entry].read(path)
-    return open_prior(where, Prior, degree=degree, usual_shape=usual_shape)
+    return open_prior(where, Prior, degree=degree, frame=frame, usual_shape=usual_shape)
 
 
 def _by_detector(values, covariance, inside, rows, keys):
@@ -383,10 +417,13 @@ def _paired(one, two):
         pairs = [(next(iter(one.statics)), next(iter(two.statics)))]
     else:
         pairs = [(key, key) for key in one.statics if key in two.statics]
-    if len(pairs) < max(len(one.statics), len(two.statics)):
+    if len(pairs) < max(len(one.statics), len(two.statics)) and not (pairs and (one.is_named or two.is_named)):
+        cure = "compare maps of the same detectors"
+        if 1 in (len(one.statics), len(two.statics)):
+            cure += ": a file whose header names the detector (DETECTOR), or a camera file (Camera.write)"
         raise InputError(
             f"{one.label} has detectors {some_of(list(one.statics), 6)}, {two.label} has "
-            f"{some_of(list(two.statics), 6)}: compare maps of the same detectors"
+            f"{some_of(list(two.statics), 6)}: {cure}"
         )
     for mine, theirs in pairs:
         shapes = one.shapes[mine], two.shapes[theirs]

@@ -206,6 +206,11 @@ def of_files(exposures, ids):
     return out
 
 
+def stated_detector(header):
+    """The detector that a header names by a keyword of files of single detectors; empty for none."""
+    return next(filter(None, (str(header.get(keyword, "")).strip() for keyword in _OF_FILES)), "")
+
+
 def _named_in(header):
     """What a header may call its detector."""
     return [str(header.get(keyword, "")).strip() for keyword in dict.fromkeys((*_OF_FILES, *KEYWORDS))]

@@ -49,6 +49,8 @@ def plot_difference(difference, *, ax=None, scale=None):
         None: difference.why_not,
     }
     words = f"difference {difference.rms:.2g} px rms ({verdict[difference.agrees]}), arrows x {scale:g}"
+    if difference.n_undetermined and difference.agrees is not None:
+        words += f"\n{difference.n_undetermined} directions are not determined, and not drawn"
     first, second = (elements.shorten(each) for each in difference.labels)
     elements.set_title(ax, f"{second}\nagainst {first}:\n{words}", size="small")
     return ax

@@ -16,6 +16,7 @@ from ..cameras.source import of_maps, of_powers
 from ..exceptions import AssumptionWarning, InputError, warn, without_astropy_warnings
 from ..geometry import basis
 from ..geometry.gsaoi import GSAOI_SIZE, gsaoi_static
+from ..inputs.detector_files import stated_detector
 from ..inputs.exposure_files import read_exposures
 from ..inputs.frames.header_texts import headers_of, is_header, read_text
 from ..inputs.sky_wcs import image_wcs
@@ -136,7 +137,9 @@ def _from_tree(tree, ext, frame, name):
     if any(other is not model for other in others):  # one may stand in several places
         raise InputError(f"{name} holds several distortions: {', '.join(candidates)}; choose one with ext (--ext)")
     if whole:
-        return as_source(model, frame=frame, name=name)
+        instrument = _meta_of(tree).get("instrument")
+        named = instrument.get("detector") if isinstance(instrument, dict) else None
+        return _of_detector(as_source(model, frame=frame, name=name), str(named or ""))
     return _refuse(_reference_model(model, tree, name), frame=frame)
 
 
@@ -150,11 +153,16 @@ def _models(tree, path=""):
                 yield from _models(value, f"{path}.{key}".lstrip("."))
 
 
-def _reference_model(model, tree, name):
-    """A bare model; distortion reference files of JWST and Roman state that it leads from pixels to V2 and V3."""
+def _meta_of(tree):
+    """What a tree of JWST or Roman states of its data; empty for nothing."""
     roman = tree.get("roman")
     meta = roman.get("meta") if isinstance(roman, dict) else tree.get("meta")
-    if not isinstance(meta, dict) or str(meta.get("reftype")).lower() != "distortion":
+    return meta if isinstance(meta, dict) else {}
+
+
+def _reference_model(model, tree, name):
+    """A bare model; distortion reference files of JWST and Roman state that it leads from pixels to V2 and V3."""
+    if str(_meta_of(tree).get("reftype")).lower() != "distortion":
         return of_model(model, name)
     known = {"direction": DIRECTIONS[0], "origin": 0, "sphere": 1 / 3600, "details": {"frame": "v2v3"}}
     return of_model(model, name, **known)
@@ -166,8 +174,13 @@ def _reference_model(model, tree, name):
 def _read_fits(path, ext, frame):
     with path.open("rb") as file, open_fits(file, path) as hdulist:
         if ext is None and "ASDF" in hdulist:
-            return _from_hdu(hdulist["ASDF"], frame, str(path))
+            return _of_detector(_from_hdu(hdulist["ASDF"], frame, str(path)), stated_detector(hdulist[0].header))
         return _refuse(_from_hdulist(hdulist, ext, str(path)), frame=frame)
+
+
+def _of_detector(source, name):
+    """The source with the name of its detector, if that is stated."""
+    return replace(source, details=source.details | ({"detector": name} if name else {}))
 
 
 def _from_hdu(hdu, frame, name):
@@ -209,7 +222,8 @@ def _from_header(header, name, hdulist=None):
     except Exception as error:  # wcslib raises many kinds
         raise InputError(f"{name}: its WCS cannot be read ({' '.join(str(error).split())})") from None
     kind = "FITS header, " + str(header.get("CTYPE1", "WCS"))
-    return replace(source, kind=kind, shape=source.shape or _shape(header))
+    named = stated_detector(header) or (stated_detector(hdulist[0].header) if hdulist else "")
+    return _of_detector(replace(source, kind=kind, shape=source.shape or _shape(header)), named)
 
 
 def _shape(header):

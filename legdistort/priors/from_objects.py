@@ -16,6 +16,8 @@ from ..runtime.words import DIRECTIONS
 
 #: Frames of a gwcs where the distortion ends and pointing has not begun, in order of preference.
 PLANES = ("undistorted", "v2v3")
+#: Name by which the last frame of a gwcs, where it is one of the sky, may be asked for whatever it is called.
+SKY = "sky"
 #: Departure [pix] from a linear map below which a FITS WCS has no distortion.
 NOTHING = 1e-6
 
@@ -27,7 +29,8 @@ def as_source(model, *, frame=None, name="the model"):
     ----------
     model : callable, `~astropy.modeling.Model`, `~gwcs.wcs.WCS`, `~astropy.wcs.WCS`, SIAF aperture, or `Source`
     frame : str, optional
-        Of a gwcs, the frame that serves as undistorted plane (default: the first of `PLANES`, or else the last);
+        Of a gwcs, the frame that serves as undistorted plane (default: the first of `PLANES`, or else the last;
+        "sky" is the last, if it is one of the sky and none has that name);
         of a SIAF aperture, ``"idl"`` (default) or ``"tel"``.
     name : str, optional
         For messages.
@@ -90,6 +93,8 @@ def _of_gwcs(wcs, frame, name):
     names = list(frames)
     if frame is None:
         frame = next((plane for plane in PLANES if plane in names[1:]), names[-1])
+    if frame == SKY and SKY not in names and isinstance(frames[names[-1]], cf.CelestialFrame):
+        frame = names[-1]
     if frame not in names[1:]:
         raise InputError(f"{name}: no frame {frame!r} after {names[0]!r}; it has {', '.join(map(repr, names[1:]))}")
     transform, end = wcs.get_transform(names[0], frame), frames[frame]

@@ -302,8 +302,9 @@ class Prior(ShownAsPrinted):
         origin : {0, 1}, optional
             Coordinate of the centre of the model's first pixel (default 0; WCSs and apertures state it).
         frame : str, optional
-            Where to end: of a gwcs, the name of a frame (default "undistorted", or else "v2v3", or else the last); of a
-            SIAF aperture "idl" (default) or "tel".
+            Where to end: of a gwcs, the name of a frame (default "undistorted", or else "v2v3", or else the last; "sky"
+            is the last one, where that is on the sky, whatever it is called); of a SIAF aperture "idl" (default) or
+            "tel".
         degree : int
             Total degree of the Legendre series; `truncation` is what it leaves out.
         parity : {1, -1, None}

@@ -405,6 +405,10 @@ class Diagnostics:
     higher_static : float or None
         Rms per axis over the detector, pixels, of what exposures were found to have in common beyond the degree of the
         fit; it is part of every distortion. None: nothing was found.
+    static_departure : dict or None
+        How far static distortions that were fitted depart from those that were given, rms per axis over the detector,
+        pixels: ``{detector: (rms, its error)}``, that of a map that all detectors share aside, or ``(rms,)`` where it
+        is not at hand. None: none was fitted, or none given.
     pointing : HeaderPointing or None
         How well the headers tell where the plane lies on the sky, where they do.
     terms : tuple of FittedTerm
@@ -426,6 +430,7 @@ class Diagnostics:
     correlated: CorrelatedErrors | None = None
     motion_scatter: MotionScatter | None = None
     higher_static: float | None = field(default=None, metadata=_PIXELS)
+    static_departure: dict[str, tuple[float, ...]] | None = field(default=None, metadata=_PIXELS)
     pointing: HeaderPointing | None = None
     terms: tuple[FittedTerm, ...] = ()
 
@@ -480,8 +485,8 @@ class Diagnostics:
         Returns
         -------
         dict
-            ``{"errors" | "widths" | "modes" | "higher" | "degree" | "motion" | "terms" | "kept": sentence}``, those
-            that apply.
+            Those that apply, ``{"errors" | "widths" | "modes" | "higher" | "static" | "degree" | "motion" | "terms" |
+            "kept": sentence}``.
         """
         found = self.error_law or self.correlated
         words = {} if found is None else {"errors": str(found)}
@@ -503,6 +508,8 @@ class Diagnostics:
                 f"terms beyond the degree that all exposures of a detector have in common, {self.higher_static:.2g} px "
                 "rms per axis, are part of every distortion"
             )
+        if self.static_departure:
+            words["static"] = _departure_in_words(self.static_departure)
         if self.selection is not None:
             words["degree"] = self.selection.sentence
         if self.motion_scatter is not None:
@@ -516,7 +523,7 @@ class Diagnostics:
     def summary(self) -> dict[str, Any]:
         """What there is of it as plain numbers and strings by name, for summaries."""
         names = "widths", "effective_modes", "departure_ratio", "selection", "validation", "error_law", "correlated"
-        names += ("motion_scatter", "higher_static", "terms")
+        names += ("motion_scatter", "higher_static", "static_departure", "terms")
         return {name: found for name, found in asdict(self).items() if name in names and found not in (None, ())}
 
 
@@ -529,6 +536,19 @@ def _by_law(covariance, law, flux, exposure):
     correlation = np.divide(covariance[known, 0, 1], np.sqrt(a * b), out=np.zeros(len(a)), where=a * b > 0)
     out[known] = variance[:, None, None] * (np.eye(2) + correlation[:, None, None] * np.eye(2)[::-1])
     return out
+
+
+def _departure_in_words(found):
+    """How far static distortions depart from those given, by detector, the farthest first."""
+    listed = sorted(found.items(), key=lambda each: -each[1][0])
+    several = len(listed) > 1
+    each = []
+    for name, (rms, *error) in listed:
+        known = f" (error {error[0]:.2g} px)" if error else ""
+        each.append(f"{rms:.2g} px rms per axis{known}{f' on {name}' if several else ''}")
+    which = "distortions depart from those" if several else "distortion departs from the one"
+    aside = "; the errors leave out that of a map that all detectors share" * any(len(e) > 1 for _, e in listed)
+    return f"the static {which} given by {some_of(each, _MOST_NAMED)}{aside}"
 
 
 def _in_words(widths):

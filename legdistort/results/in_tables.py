@@ -167,13 +167,13 @@ def rms(solution):
 
 
 def pixel_scale(solution):
-    """Arcsec a pixel where that was stated, by the sky if there is one; else None."""
-    stated = solution.settings.pixel_scale
-    return None if stated is None else float(stated if solution.sky is None else solution.sky.pixel_scale)
+    """Arcsec a pixel: that of the sky if there is one, else that stated; None without either."""
+    stated = solution.settings.pixel_scale if solution.sky is None else solution.sky.pixel_scale
+    return None if stated is None else float(stated)
 
 
 def in_mas(solution):
-    """Figures in mas where a pixel scale was stated, by that of the sky if there is one; else None.
+    """Figures in mas where the sky is known or a pixel scale was stated; else None.
 
     ``pixel_scale_arcsec``; ``rms_mas``, residuals per axis; medians over the stars of ``error_mas``, ``error_abs_mas``,
     ``motion_error_mas_yr``, ``motion_error_abs_mas_yr``: None where nothing is known.

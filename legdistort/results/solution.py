@@ -223,7 +223,7 @@ class Solution(ShownAsPrinted):
         ``ra``, ``dec`` [deg, ICRS], ``ra_error`` (of ra cos(dec)), ``dec_error`` [mas], ``ra_dec_corr``,
         ``ra_error_abs``, ``dec_error_abs`` [mas], named as in the Gaia catalogue, and ``sky``, the same places as a
         `~astropy.coordinates.SkyCoord` (not in files). ``meta`` has ``frame``, ``epoch`` (a Julian year, if it is
-        known), ``gauge``, ``degree``, ``pixel_scale`` (arcsec, if one was stated), ``prior`` and ``version``.
+        known), ``gauge``, ``degree``, ``pixel_scale`` (arcsec, of the sky or as stated), ``prior`` and ``version``.
 
         Where motions were fitted, positions are those of the epoch, and there are ``vx``, ``vy`` [pix/yr], with a sky
         ``pmra`` (with cos(dec)), ``pmdec`` [mas/yr] and, if it was fitted, ``parallax`` [mas], all with relative and

@@ -29,6 +29,7 @@ from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, validation
 from .equations import effective_modes
 from .gauge import known_poses
+from .knowledge.static_departure import static_departures
 from .motion_choice import resolve as resolve_motion
 from .options import CLIP, DEGREE, SolveOptions, Unasked, check_detectors, check_tie, prior_as_asked, with_stated
 from .residual_errors.by_brightness import estimate_by_brightness
@@ -260,7 +261,7 @@ def solve(
         fit, found, (options, chosen) = fit_with(asked.terms, tie, _fitted, given, options, sought, join)
         _tell(fit, given)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
-        diagnostics = replace(_diagnostics(fit, prior, scale), pointing=given.pointing, terms=found(scale), **chosen)
+        diagnostics = _diagnostics(given, fit, prior, scale, pointing=given.pointing, terms=found(scale), **chosen)
         fit = _placed(fit, sought, given) if tie is None else tie(fit, scale=scale)
     epoch = given.epoch if epoch is None else epoch
     sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
@@ -277,7 +278,7 @@ def solve(
 
 def solution_of(fit, asked, **settings):
     """The `Solution` of a `Fit` to matches that were given, with some `SolveOptions`; words in its `Settings`."""
-    diagnostics = replace(_diagnostics(fit, asked.prior, 1.0), epoch=fit.matches.epoch)
+    diagnostics = replace(_diagnostics(fit.matches, fit, asked.prior, 1.0), epoch=fit.matches.epoch)
     found = replace(diagnostics, sky=None if fit.matches.sky is None else "exposures")
     return _solution(fit, 1.0, replace(_settings(asked, asked, None), **settings), found)
 
@@ -537,8 +538,8 @@ def _tell_lost_stars(fit):
     )
 
 
-def _diagnostics(fit, prior, scale):
-    """What was found before a reference is used."""
+def _diagnostics(given, fit, prior, scale, **found):
+    """What was found in matches that were given, before a reference is used, beside what is found already."""
     each = prior.values() if isinstance(prior, dict) else [prior]
     return Diagnostics(
         error_floor=float(fit.options.error_floor),
@@ -547,7 +548,9 @@ def _diagnostics(fit, prior, scale):
         prior_has_widths=any(p is not None and p.sigma is not None for p in each),
         effective_modes=dict(zip(fit.problem.names, fit.effective_modes.round(3).tolist(), strict=True)),
         higher_static=_higher(fit.problem),
+        static_departure=static_departures(given, fit, scale),
         departure_ratio=effective_modes.departure_ratio(fit.problem, fit.result.gauge, fit.blocks, fit.uncertainty),
+        **found,
     )
 
 

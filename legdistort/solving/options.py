@@ -312,7 +312,11 @@ def check_tie(matches, asked, reference, **tying):
             "leave one of them out"
         )
     if catalogue is not None and asked.pose_sigma is not None:
-        raise InputError("pose_sigma and reference both say where the reference plane lies: leave one of them out")
+        raise InputError(
+            "pose_sigma and reference both say where the reference plane lies: take the reference where half a dozen "
+            "of its stars or more are on the exposures, and leave pose_sigma (--pose-sigma) out; else leave the "
+            "reference (--reference) out"
+        )
     if len(matches.names) > 1:
         return catalogue, epoch
     (name,) = matches.names

@@ -50,8 +50,8 @@ def by_detector(matches, static):
     return made, {key: prior for key, (_, prior) in own.items()}
 
 
-def _known(detector, static):
-    """Similarity (2, 3) from the focal plane to a detector, and the rest of its map as a `Prior`."""
+def map_alone(detector):
+    """Similarity (2, 3) from the focal plane to a detector, and coefficients (2, n_modes) of the rest of its map."""
     t = np.linspace(-1, 1, 9)
     q = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), detector.shape)
     pose = similarity.fit_similarity(similarity.apply(similarity.invert(detector.layout), q), q)
@@ -61,7 +61,13 @@ def _known(detector, static):
         place = basis.denormalize(u, v, detector.shape)
         return (detector.to_pixels(similarity.apply(back, place)) - place).T
 
-    degree = max(basis.degree_of(detector.static.shape[1]), 1)
+    return pose, basis.project(shift, max(basis.degree_of(detector.static.shape[1]), 1))
+
+
+def _known(detector, static):
+    """The same with what is known of the rest, as a `Prior`."""
+    pose, mean = map_alone(detector)
+    degree = basis.degree_of(mean.shape[1])
     placed = detector.layout_sigma is None or np.isinf(detector.layout_sigma).all()  # nothing but its shear counts
     widths = [None if placed else detector.layout_sigma, detector.static_sigma]
     sigma = None
@@ -69,5 +75,4 @@ def _known(detector, static):
         layout, own = (0.0 if w is None else basis.change_degree(w, degree) for w in widths)
         low = np.arange(basis.n_modes(degree)) < 3
         sigma = np.where(low, layout, own) * np.ones((2, 1))
-    mean = basis.project(shift, degree)
     return pose, Prior(mean, sigma="evidence" if static != "fit" else None, static_sigma=sigma, shape=detector.shape)

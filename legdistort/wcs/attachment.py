@@ -20,7 +20,7 @@ from ..exceptions import ExportError, InputError, some_of, without_astropy_warni
 from ..inputs import detector_files, exposure_files, exposure_names, file_images
 from ..inputs.frames import header_texts, wcs_cards
 from ..inputs.frames.weight_maps import WeightMaps
-from ..inputs.sky_wcs import header_wcs, leads_elsewhere, warn_of_another_field
+from ..inputs.sky_wcs import leads_elsewhere, warn_of_another_field
 from ..inputs.wcs_files import PLACES
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD
@@ -29,6 +29,7 @@ from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read
 from ..runtime.outputs import replacing, replacing_files, replacing_folder
 from ..runtime.progress import Bar
 from .fits_headers import header_error
+from .footprints import former_wcs, renewed_footprint
 from .foreign_trees import model_wcs, refined_tree, table_of
 from .refinement import corner_move
 from .storage import wcs_tree
@@ -95,9 +96,10 @@ def attach(
     ``stdatamodels.asdf_in_fits.open`` reads. Where a pipeline (JWST) keeps its data model there, the gwcs in that is
     refined (`legdistort.refine`), and every other key and byte of it stays; so it is with ASDF files of Roman. Errors,
     flags and weights beside the image (``ERR``, ``DQ`` and the like, of its shape and ``EXTVER``) get the keywords as
-    well. Every other HDU, card and byte stays as it is, but for what would be taken for the WCS of the image before
-    that: plates of scans (DSS: ``PLTRAH``, ``AMDX1``, ``XPIXELSZ`` ...), polynomials of IRAF and wcstools. The errors
-    hold for the header as it stands in the file. Nothing is written unless everything can be.
+    well. The corners of a footprint ``S_REGION`` stay at their pixels, and get new places. Every other HDU, card and
+    byte stays as it is, but for what would be taken for the WCS of the image before that: plates of scans (DSS:
+    ``PLTRAH``, ``AMDX1``, ``XPIXELSZ`` ...), polynomials of IRAF and wcstools. The errors hold for the header as it
+    stands in the file. Nothing is written unless everything can be.
 
     Frames are identified by their names, as `read_exposures` gives them; where none is so called, by these but for the
     last word, as products of pipelines differ (``x_cal``, ``x_wcs``), which is logged. A frame that was left out of the
@@ -158,9 +160,11 @@ def attach(
     warn_of_another_field([name for plan in plans for name in plan.elsewhere])
     if images.moved:
         far = max(images.moved, key=images.moved.get)
+        kept = kind is None and any(plan.whole is None for plan in plans)
         log.info(
-            "corners of %d images move by up to %.3g arcsec (%s)", len(images.moved), images.moved[far].arcsec, far
-        )
+            "corners of %d images move by up to %.3g arcsec (%s)%s", len(images.moved), images.moved[far].arcsec, far,
+            "; their headers, which --asdf-only leaves as they were, are off by as much" * kept,
+        )  # fmt: skip
     if unknown := _unknown_sky(solution):
         log.warning("%s", unknown)
     if alike := [f"{plan.path.name} as {v.name}" for plan in plans for v in map(images.views.get, plan.headers)
@@ -305,7 +309,9 @@ def _plan(known, path, target, *, kind, max_error, ext, overwrite):
     with readable(path), open_bytes(raw) as hdulist:
         images = _images(known, hdulist, path, ext)
         elsewhere = [
-            name for name, image in images.items() if _is_elsewhere(known.views[name], hdulist, hdulist[image])
+            name
+            for name, image in images.items()
+            if leads_elsewhere(former_wcs(known.views[name], hdulist, hdulist[image]), known.views[name])
         ]
         for name, image in images.items():
             headers[name] = None
@@ -317,7 +323,9 @@ def _plan(known, path, target, *, kind, max_error, ext, overwrite):
                         of_images[number] = headers[name]
                         continue
                     start, data, stop, _ = spans[number]
-                    new = exchange_cards(raw[start:data], raw[data:stop], headers[name], WCS_KEYWORDS)
+                    footprint = renewed_footprint(known.views[name], hdulist, hdulist[number])
+                    obsolete = WCS_KEYWORDS if not footprint else re.compile(f"S_REGION|{WCS_KEYWORDS.pattern}")
+                    new = exchange_cards(raw[start:data], raw[data:stop], headers[name] + footprint, obsolete)
                     _check_written(new, headers[name], known.views[name], path)
                     edits.append((start, data, new))
         if kind == "head":
@@ -371,18 +379,6 @@ def _head(hdulist, of_images):
     """A file ``.head``, a text: the cards of every image, ``{number: Header}``, none for one without a solution."""
     images = (k for k, hdu in enumerate(hdulist) if file_images.is_image(hdu))
     return header_texts.text_of(of_images.get(k, fits.Header()) for k in images).encode("ascii")
-
-
-def _is_elsewhere(view, hdulist, hdu):
-    """Whether the header of an image leads far from where the solution has it."""
-    with without_astropy_warnings():
-        header = wcs_cards.header_of_image(hdulist[0].header, hdu.header)
-        try:
-            wcs_cards.make_numbers(header, view.label)
-        except InputError:  # it gives way
-            return False
-        wcs = header_wcs(header, hdulist, file_images.plane_shape(hdu), view.label, level=logging.DEBUG)
-    return leads_elsewhere(wcs, view)
 
 
 def _header(known, name, kind, max_error):

@@ -3,9 +3,24 @@
 import json
 
 import four_detectors
+import gwcs
 import numpy as np
 import pytest
-from astropy.modeling.models import Identity, Legendre2D, Mapping
+from astropy import coordinates as coord
+from astropy.io import fits
+from astropy.modeling.models import (
+    AffineTransformation2D,
+    Identity,
+    Legendre2D,
+    Mapping,
+    Pix2Sky_TAN,
+    Polynomial2D,
+    RotateNative2Celestial,
+    Scale,
+    Shift,
+)
+from astropy.table import Table
+from gwcs import coordinate_frames as cf
 from matplotlib import pyplot
 from night_sets import SIZE, Nights, field
 from numpy.testing import assert_allclose
@@ -217,6 +232,95 @@ def test_a_night_of_a_camera_is_compared_detector_by_detector():
     assert "mostly in L1(x) L1(y) along x of detector 1 (-0.1" in wrong.sentence
     with pytest.raises(InputError, match=r"static distortions of camera FOUR as given, .* solve it with static='fit'"):
         ld.difference(four(1), ld.solve(four_detectors.matches("layout", 1), layout="fit", degree=2))
+
+
+def tied(seed, error=0.05):
+    """A night of the camera of `four`, tied to the truth of 40 stars with errors."""
+    rng, extent = np.random.default_rng(seed), 2 * (four_detectors.SIZE + four_detectors.GAP)
+    stars, noise = rng.uniform(-400, extent + 340, (160, 2)), np.random.default_rng(1000 + seed)
+    rows = noise.choice(160, 40, replace=False)
+    xy = stars[rows] + error * noise.normal(size=(40, 2))
+    known = Table(
+        {"star": rows.astype(str), "x": xy[:, 0], "y": xy[:, 1], "x_err": 40 * [error], "y_err": 40 * [error]}
+    )
+    matches = four_detectors.matches("static", seed, n=6, n_stars=160)
+    return ld.solve(matches, static="fit", layout="fit", degree=2, reference=known)
+
+
+def test_what_a_reference_tells_of_a_camera_counts():
+    """What all detectors share, exposures can take over: 6 directions more are not determined without a reference."""
+    night = tied(2)
+    bent = four(2)
+    for key, chip in bent.detectors.items():
+        more = chip.static.copy()
+        more[0, 3] += 0.15
+        bent.detectors[key] = ld.Detector(chip.shape, layout=chip.layout, static=more)
+    right, wrong = ld.difference(four(2), night), ld.difference(ld.Camera("bent", bent.detectors), night)
+    assert right.n_undetermined == 8  # shears, which layouts have
+    assert right.agrees
+    assert wrong.rms == pytest.approx(0.15 / np.sqrt(8), rel=0.25)
+    assert wrong.sigmas > 5
+    ax = wrong.plot()
+    assert "8 directions are not determined, and not drawn" in ax.get_title(loc="left")
+    pyplot.close(ax.figure)
+
+
+def test_modes_that_a_night_was_given_and_did_not_fit_do_not_count():
+    matches, chips = four_detectors.matches("static", 1), {}
+    for key, chip in matches.camera.detectors.items():
+        chips[key] = ld.Detector(chip.shape, layout=chip.layout, static=np.zeros((2, 15)))
+    camera = ld.Camera("of degree 4", chips, matches.camera.field)
+    night = ld.solve(
+        ld.Matches.from_table(matches.camera.on_detectors(matches.table), camera=camera, poses=matches.poses),
+        static="fit", layout="fit", degree=2,
+    )  # fmt: skip
+    found = ld.difference(four(1), night)
+    assert found.coefficients["0"].shape == (2, 6)
+    assert found.agrees
+
+
+def test_a_file_that_names_its_detector_is_compared_with_that_of_a_camera(tmp_path):
+    header = fits.Header({"CTYPE1": "RA---TAN-SIP", "CTYPE2": "DEC--TAN-SIP", "CRVAL1": 10.0, "CRVAL2": -30.0})
+    header.update({"CRPIX1": 256.5, "CRPIX2": 256.5, "CD1_1": -1e-5, "CD1_2": 0.0, "CD2_1": 0.0, "CD2_2": 1e-5})
+    header.update({"A_ORDER": 2, "B_ORDER": 2, "A_2_0": 2e-6, "B_1_1": 1e-6, "DETECTOR": "b"})
+    path, other = tmp_path / "named.fits", tmp_path / "other.fits"
+    fits.PrimaryHDU(np.zeros((512, 512), "f4"), header).writeto(path)
+    del header["DETECTOR"]
+    fits.PrimaryHDU(np.zeros((512, 512), "f4"), header).writeto(other)
+    beside = np.array([[1.02, 0, -600], [0, 1, 0]])  # the shear of a layout is a part of the map
+    static = ld.Prior.from_file(path).mean.copy()
+    chips = {"a": ld.Detector((512, 512)), "b": ld.Detector((512, 512), layout=beside, static=static)}
+    found = ld.difference(path, ld.Camera("pair", chips))
+    assert found.left_out == ("a",)
+    assert list(found.shapes) == ["b"]
+    assert found.sentence.endswith("(detector b; without a)")
+    sheared = np.abs(found.coefficients["b"]) > 1e-2
+    assert np.argwhere(sheared).tolist() == [[0, 1], [1, 2]]
+    assert found.coefficients["b"][0, 1] == pytest.approx(0.01 * 256 / (0.5 * np.sqrt(3)), rel=0.03)
+    with pytest.raises(InputError, match=r"has 1, pair|of the same detectors: a file whose header names the detector"):
+        ld.difference(other, ld.Camera("pair", chips))
+
+
+def test_gwcs_that_end_in_other_frames_are_compared_on_the_sky():
+    """The shear of a camera's pixels stands before the plane of one, and after that of the other."""
+    bent = Mapping((0, 1, 0, 1)) | (Polynomial2D(2, c1_0=1, c2_0=1e-6) & Polynomial2D(2, c0_1=1, c1_1=2e-6))
+    sheared = AffineTransformation2D([[1.01, 0.003], [0.003, 0.99]], [-256, -256]) | Scale(0.1) & Scale(0.1)
+    to_sky = (Scale(1 / 3600) & Scale(1 / 3600)) | Pix2Sky_TAN() | RotateNative2Celestial(10.0, -30.0, 180.0)
+    pixels, sky = (cf.Frame2D(name="detector"), cf.CelestialFrame(name="world", reference_frame=coord.ICRS()))
+    shape = {"bounding_box": ((-0.5, 511.5), (-0.5, 511.5))}
+
+    def made(name, first, second):
+        plane = cf.Frame2D(name=name, unit=("arcsec", "arcsec") if name == "v2v3" else ("pix", "pix"))
+        steps = [(pixels, first), (plane, second), (sky, None)] if second else [(pixels, first), (plane, None)]
+        out = gwcs.WCS(steps)
+        out.bounding_box = shape["bounding_box"]
+        return out
+
+    one, two = made("undistorted", bent, sheared | to_sky), made("v2v3", bent | sheared, to_sky)
+    assert ld.difference(one, two).rms < 1e-4
+    assert ld.difference(one, made("v2v3", Shift(0) & Shift(0) | sheared, to_sky)).rms > 0.02
+    with pytest.raises(InputError, match=r"frame 'undistorted', .* 'v2v3', .*: compare priors .* one frame"):
+        ld.difference(one, made("v2v3", bent | sheared, None))
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from night_sets import Nights
 from legdistort import Matches, coadd, match, measure, read_exposures, simulate_exposures, simulate_matches, solve
 from legdistort.assessment.run_checks import check_run
 from legdistort.exceptions import AssumptionWarning
+from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.pipeline import write_results
 from legdistort.reporting.summary import summarise
 
@@ -29,6 +30,18 @@ def test_figures_are_those_of_the_tables():
     assert found["rms_px"] == pytest.approx(np.sqrt(np.mean(left**2)), rel=1e-6)
     assert found["timings"] == {"solve": 0.123}
     assert [check["name"] for check in found["checks"]] == [check.name for check in solution.checks]
+
+
+def test_figures_in_mas_are_by_the_sky_where_no_scale_is_stated():
+    plane = TangentPlane(10.0, -70.0, np.array([[-0.02, 0.0, 3.0], [0.0, 0.02, -2.0]]) / 3600)
+    sim = simulate_matches(n_stars=30, n_exposures=6, seed=3)
+    solution = solve(replace(sim.matches, sky=plane), degree=1)
+    found, error = summarise(solution)["angles"], solution.stars["x_err", "y_err"]
+    assert found["pixel_scale_arcsec"] == pytest.approx(0.02)
+    assert found["rms_mas"] == pytest.approx(20 * summarise(solution)["rms_px"])
+    assert found["error_mas"] == pytest.approx(20 * np.median([error["x_err"].value, error["y_err"].value]))
+    assert f"angles  at 0.02 arcsec a pixel: residuals {found['rms_mas']:.3g} mas rms" in str(solution)
+    assert summarise(solve(sim.matches, degree=1))["angles"] is None
 
 
 def _valid(found):

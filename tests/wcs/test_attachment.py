@@ -515,6 +515,40 @@ def _blocks(path):
     return [fits.Header.fromstring(block, sep="\n") for block in blocks]
 
 
+@pytest.mark.parametrize("corner", [-0.5, 0.0], ids=["edges", "middles"])
+def test_a_footprint_keeps_its_pixels(one, tmp_path, corner):
+    """Of the former WCS, a plain one that is off by pixels; corners are rounded to halves of them."""
+    (ny, nx), made = SHAPE, one["frame"].header(kind="sip")
+    former = fits.Header({key: made[key] for key in ("CRVAL1", "CRVAL2", "CRPIX1", "CRPIX2")})
+    former.update({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": made["CRPIX1"] + 4.0})
+    former.update({key: made[key] for key in made if key.startswith(("CD", "PC"))})
+    pixels_of = np.array([[corner, corner], [nx - 1 - corner, corner], [nx - 1 - corner, ny - 1 - corner]])
+    sky = WCS(former).all_pix2world(pixels_of + [[0.1, -0.1]], 0)
+    former["S_REGION"] = "POLYGON ICRS  " + " ".join(f"{each:.9f}" for each in sky.ravel())
+    path = tmp_path / "frame.fits"
+    images = [fits.PrimaryHDU(pixels(), former), fits.ImageHDU(np.zeros(3), fits.Header({"S_REGION": "CIRCLE 1 2 3"}))]
+    fits.HDUList(images).writeto(path, checksum=True)
+    attach(one, path, in_place=True)
+    check_sums(path)
+    with fits.open(path) as hdus:
+        text, wcs = hdus[0].header["S_REGION"], WCS(hdus[0].header)
+        assert hdus[1].header["S_REGION"] == "CIRCLE 1 2 3"
+    assert text.startswith("POLYGON ICRS  ")
+    renewed = np.array(text.split()[2:], dtype=float).reshape(-1, 2)
+    assert np.abs(renewed - sky).max() > 1e-6
+    assert_allclose(wcs.all_world2pix(renewed, 0), pixels_of, atol=0.01)
+
+
+@pytest.mark.parametrize("text", ["CIRCLE ICRS 1 2 3", "POLYGON ICRS 1 2 3", "POLYGON 10 20 30 40 50 60", ""])
+def test_a_footprint_of_another_kind_or_place_stays(one, frame, text):
+    with fits.open(frame, mode="update", do_not_scale_image_data=True) as hdus:
+        for key in OLD:
+            hdus[0].header.remove(key, ignore_missing=True)
+        hdus[0].header["S_REGION"] = text
+    attach(one, frame, in_place=True)
+    assert fits.getheader(frame)["S_REGION"] == text
+
+
 def test_head_files_have_a_block_for_every_image(geometry, tmp_path):
     """In the order of the file, for errors and flags that of their image, and the frames as they were."""
     solution = geometry(3, 2.0, shape=SHAPE, names=("night_SCI1", "night_SCI2"))

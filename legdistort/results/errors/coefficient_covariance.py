@@ -31,3 +31,11 @@ def times(covariance, matrix):
     if covariance.ndim == 2:
         return covariance @ matrix
     return (covariance @ matrix.reshape(*covariance.shape[:2], -1)).reshape(len(matrix), -1)
+
+
+def mean_covariance(covariance, n_exposures):
+    """That of the mean coefficients of all exposures, shape (k, k)."""
+    if covariance.ndim == 3:
+        return covariance.mean(axis=0) / n_exposures
+    size = len(covariance) // n_exposures
+    return covariance.reshape(n_exposures, size, n_exposures, size).mean(axis=(0, 2))

@@ -14,6 +14,7 @@ from ...results.check import FALSE_ALARM, STATES, WRONG
 from ...results.diagnostics import ErrorLaw
 from ..terms.turbulence import can_be_found
 from .known_effects import MOTIONS, SHARE, STATICS, effects_in
+from .residual_tests import in_cells
 from .smooth_fields import smooth_fields
 
 #: Part of what chi2 is too large by that an effect must explain to be named as its reason.
@@ -34,6 +35,9 @@ _WOULD = {"pass": "this check would pass", "unknown": "this check would be unkno
 _RMS = "place", "time", "degree"
 _OF_ERRORS = "chi2", "brightness"
 _BY_FIELDS = "chi2", "brightness", "degree"
+#: Those that a static distortion of too low a degree fails, and what they say of it.
+_BY_DEGREE = "degree", "place"
+_STATIC = "; what is missing is alike in all exposures of a detector (static)"
 
 
 def with_cures(checks, solution, residuals, observed, judged):
@@ -55,6 +59,11 @@ def with_cures(checks, solution, residuals, observed, judged):
     explained : set of str
         Those that do not pass for a reason that they name.
     """
+    static = _static_modes(observed) if solution.settings.static == "fit" else None
+    if static is not None and any(checks[name].state in WRONG for name in _BY_DEGREE):
+        higher, ends, after = _higher_degree(residuals, static)
+        if ends and judged(after)["chi2"].state not in WRONG:  # then it is the degree and no more
+            return _with_static_degree(checks, higher)
     effects = effects_in(residuals, observed)
     checks, explained = _named(checks, effects, judged, static=solution.settings.static)
     wrong = [name for name, check in checks.items() if check.state in WRONG and name not in explained]
@@ -66,7 +75,10 @@ def with_cures(checks, solution, residuals, observed, judged):
         checks |= {name: replace(checks[name], cure=cure) for name in wrong}
         explained |= cured
     elif "degree" in wrong and residuals.next_degree[0].p <= FALSE_ALARM:
-        higher, ends, after = _higher_degree(left)
+        higher, ends, after = _higher_degree(left, static)
+        checks["degree"] = replace(
+            checks["degree"], sentence=checks["degree"].sentence + _STATIC * bool(static and ends)
+        )
         rest = "" if ends else cure or "--errors floor counts the rest"
         found = solution.settings.errors != "stated"
         checks["degree"] = _with_degree(checks["degree"], higher, rest, counted=found)
@@ -76,11 +88,19 @@ def with_cures(checks, solution, residuals, observed, judged):
     }
     if ends and judged(after)["chi2"].state not in WRONG:  # then it is the degree and no more
         return checks, explained
-    fields = smooth_fields(left)
+    # what a higher degree explains of a static distortion is no smooth field of single exposures
+    fields = smooth_fields(after if static is not None and higher else left)
     own = without_static(solution) if solution.settings.static == "fit" and observed.detector is None else ""
     found = observed.detector is None and not solution.settings.terms and can_be_found(observed.problem)
     concerned = [name for name in wrong if name in _BY_FIELDS]
     return checks | {name: _with_fields(checks[name], fields, own, found) for name in concerned}, explained
+
+
+def _with_static_degree(checks, higher):
+    """Checks that a higher degree of the static distortion brings to pass, with it as their cure, and their names."""
+    names = {name for name in (*_OF_ERRORS, *_BY_DEGREE) if name in checks and checks[name].state in WRONG}
+    sentences = {name: checks[name].sentence + _STATIC * (name in _BY_DEGREE) for name in names}
+    return checks | {name: replace(checks[name], sentence=sentences[name], cure=higher) for name in names}, names
 
 
 def without_static(solution):
@@ -132,8 +152,31 @@ def _with_fields(check, fields, cure, can_be_term):
     return replace(check, sentence=f"{check.sentence}; {words}{fields.rms:.2g} px rms", cure=cure or check.cure)
 
 
-def _higher_degree(residuals):
+def _static_modes(observed):
+    """Modes of the static distortion of detectors: a function of a first and a last degree that gives their columns.
+
+    The columns are those of `Residuals.of_columns`; residuals of one place on a detector are alike in all exposures
+    but for what the stars, which are elsewhere on it in every exposure, take up of them.
+    """
+    problem = observed.problem
+    detector = problem.detectors[problem.exposure] if observed.detector is None else observed.detector
+
+    def columns(first, last):
+        modes = basis.values(last, *observed.place)[basis.n_modes(first - 1) :]
+        return in_cells(detector, (modes[:, None, None] * np.eye(2)[:, :, None]).reshape(-1, 2, modes.shape[1]))
+
+    return columns
+
+
+def _higher_degree(residuals, static=None):
     """The lowest degree after which one more explains nothing.
+
+    Parameters
+    ----------
+    residuals : Residuals
+    static : callable, optional
+        `_static_modes`, where a static distortion is fitted: the higher degree is one of that then, and not of every
+        exposure by itself.
 
     Returns
     -------
@@ -146,23 +189,36 @@ def _higher_degree(residuals):
     """
     problem = residuals.problem
     stars = np.bincount(residuals.exposure[residuals.used], minlength=problem.n_exposures).min()
-    best, left, told = "", residuals, residuals  # what a solve would reach is told, what surely shows decides
+    # what a solve would reach is told, what surely shows decides
+    best, left, told = "", residuals, residuals
+    if static is not None and not problem.unknowns.shared:
+        # the lower degrees of a camera are no unknowns of the problem, and are counted already
+        lower = static(1, max(problem.degree, 1))
+        if _fits(residuals, lower):
+            told = residuals.without(lower, rank=_FITTED)._with(dof=residuals.dof)
     for degree in range(problem.degree + 1, problem.degree + 1 + HIGHER):
         if stars < _STARS * basis.n_modes(degree):
             break
         best = best or f"--degree {degree}"
-        columns = left.modes_of(degree)
-        if 2 * len(residuals.used) * columns[0].shape[1] > _VALUES:
+        columns = left.modes_of(degree) if static is None else static(degree, degree)
+        if not _fits(residuals, columns):
             break
-        after, told = left.without(columns), told.without(columns, rank=_FITTED)
+        told = told.without(columns, rank=_FITTED)
+        after = left.without(columns) if static is None else told
         if after.dof < 1 or told.dof < 1:
             break
         reached, left = told.chi2 / told.dof, after
         best = f"--degree {degree} would bring chi2/dof to "
         best += f"{reached:.2f}" if reached < _EXACT else f"about {reached:.2g}"
-        if left.of_degree(degree + 1).p > FALSE_ALARM:
+        more = left.of_degree(degree + 1) if static is None else left.of_columns(static(degree + 1, degree + 1))[0]
+        if more.p > FALSE_ALARM:
             return best, True, left
     return best, False, left
+
+
+def _fits(residuals, columns):
+    """Whether columns are few enough to be fitted on trial."""
+    return 2 * len(residuals.used) * columns[0].shape[1] <= _VALUES
 
 
 def _with_degree(check, higher, rest, *, counted):
