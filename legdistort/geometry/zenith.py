@@ -18,17 +18,17 @@ _ANGLE = "PARANGLE", "PARANG", "ESO TEL PARANG START"
 _GEOCENTRIC, _GEODETIC = ("OBSGEO-X", "OBSGEO-Y", "OBSGEO-Z"), ("OBSGEO-L", "OBSGEO-B", "OBSGEO-H")
 
 
-def stated_zenith(header):
+def stated_zenith(header, *, reckoned=True):
     """Tangent of the zenith distance and parallactic angle [deg] of an exposure, NaN for what is not known.
 
-    As its header states them, else from place (``RA``, ``DEC`` or the WCS), time and site (``OBSGEO``). The angle
-    counts from north through east.
+    As its header states them, else `reckoned` from place (``RA``, ``DEC`` or the WCS), time and site (``OBSGEO``). The
+    angle counts from north through east.
     """
     tangent, angle = _tangent(header), _number(header, _ANGLE)
-    if np.isnan(tangent) or np.isnan(angle):
-        reckoned = _reckoned(header)
-        tangent = reckoned[0] if np.isnan(tangent) else tangent
-        angle = reckoned[1] if np.isnan(angle) else angle
+    if reckoned and (np.isnan(tangent) or np.isnan(angle)):
+        made = _reckoned(header)
+        tangent = made[0] if np.isnan(tangent) else tangent
+        angle = made[1] if np.isnan(angle) else angle
     return tangent, angle
 
 

@@ -290,15 +290,15 @@ def _check_measured(detections):
 def _add_epochs(table, named):
     """Add the column ``epoch`` [yr] if headers state it and the table does not; NaN where one does not.
 
-    Of stars with colours also ``tan_z`` and ``parallactic_angle`` [deg], as refraction needs them.
+    Also ``tan_z`` and ``parallactic_angle`` [deg], as refraction needs them; from place, time and site for stars with
+    colours alone.
     """
     epochs = {name: header_epoch(exposure.header) for name, exposure in named.items()}
     if any(epoch is not None for epoch in epochs.values()) and "epoch" not in table.colnames:
         years = {name: np.nan if epoch is None else epoch for name, epoch in epochs.items()}
         table["epoch"] = [years.get(name, np.nan) for name in table["exposure"]] * u.yr
-    if colour_column(table) is None:
-        return
-    zenith = {name: stated_zenith(exposure.header) for name, exposure in named.items()}
+    how = {"reckoned": colour_column(table) is not None}
+    zenith = {name: stated_zenith(exposure.header, **how) for name, exposure in named.items()}
     for k, column in enumerate(("tan_z", "parallactic_angle")):
         values = [zenith.get(name, (np.nan, np.nan))[k] for name in table["exposure"]]
         if column not in table.colnames and np.isfinite(values).any():

@@ -20,7 +20,15 @@ GAUGES = ("minimal", "mean")
 LOSSES = ("linear", "huber", "cauchy")
 ERRORS = ("stated", "scale", "floor", "by-brightness", "correlated")
 MOTIONS = ("proper", "parallax", "acceleration", "auto")
-TERMS = ("refraction", "pixel_phase", "acceleration", "orbits", "rough_static", "turbulence")
+TERMS = (
+    "refraction",
+    "differential_refraction",
+    "pixel_phase",
+    "acceleration",
+    "orbits",
+    "rough_static",
+    "turbulence",
+)
 #: Those that a forecast takes by their sizes.
 SIZED_TERMS = ("refraction", "pixel_phase", "turbulence")
 #: What is done about layouts and static distortions of a camera; without one a static distortion can only be fitted.

@@ -198,9 +198,9 @@ def solve(
         a reference, to the nearest 20 per cent, where no header has a WCS on the sky.
     terms : str, Term, or a list of them, optional
         What displaces stars beside the distortion, found with everything else and left away where the positions do not
-        show it: "refraction" by the colours of stars, "pixel_phase", "rough_static" (the static distortion beyond the
-        degree, as rough as it is), "turbulence" (a random field of every exposure), or a `legdistort.Term`.
-        In `Solution.terms`.
+        show it: "refraction" by the colours of stars, "differential_refraction" over the field, "pixel_phase",
+        "rough_static" (the static distortion beyond the degree, as rough as it is), "turbulence" (a random field of
+        every exposure), or a `legdistort.Term`. In `Solution.terms`.
     progress : bool
         Show a progress bar of the iterations where they take more than a second.
 

@@ -245,6 +245,10 @@ SOLVE = [
     row(reference_error=0.1, refused=dict.fromkeys(("plain", "one", "pair"), "is for the catalogue of reference")),
     row(terms="pixel_phase"),
     row(terms=["refraction"], refused=dict.fromkeys(("plain", "one", "pair"), "lacks the columns colour, tan_z")),
+    row(
+        terms="differential_refraction",
+        refused=dict.fromkeys(("plain", "one", "pair"), "lacks the columns tan_z, parallactic_angle"),
+    ),
     row(progress=True),
 ]
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.table import QTable, vstack
 from astropy.wcs import WCS
 from displaced_fields import SIZE, sky, squared_pull
 from numpy.testing import assert_allclose
@@ -153,6 +154,63 @@ def test_a_sky_turns_the_parallactic_angle():
     matches = ld.Matches.from_table(turned, shape=(SIZE, SIZE), sky=TangentPlane(80.0, -30.0, matrix))
     here, there = (ld.solve(m, prior=field.prior, terms="refraction").terms for m in (field.matches, matches))
     assert_allclose(there["value"], here["value"], rtol=1e-3)
+
+
+def lifted(stars, zenith, constant):
+    """Directions (n, 3) lifted towards the zenith by ``constant * tan z``: each is turned about a horizontal axis."""
+    cos = stars @ zenith
+    axis = np.cross(stars, zenith)
+    axis /= np.linalg.norm(axis, axis=1)[:, None]
+    turn = (constant * np.sqrt(1 - cos**2) / cos)[:, None]
+    return stars * np.cos(turn) + np.cross(axis, stars) * np.sin(turn)
+
+
+def wide(seed, constant, *, n_stars=150, n_exposures=10, sigma=0.01):
+    """Exposures of half a degree, pixels of an arcsecond, without distortion, up to 65 degrees from the zenith.
+
+    Their table, and the plane on the sky: x to the west, y to the north.
+    """
+    rng, rows, radian = np.random.default_rng(seed), [], np.radians(1 / 3600)
+    stars, away = rng.uniform(-300, SIZE + 300, (n_stars, 2)), np.array([-1, 1]) * radian
+    for i in range(n_exposures):
+        dither, z, q = rng.uniform(-100, 100, 2), rng.uniform(0.1, 1.13), rng.uniform(-np.pi, np.pi)
+        seen = np.column_stack([(stars - SIZE / 2 - dither) * away, np.ones(n_stars)])
+        zenith = np.array([np.sin(z) * np.sin(q), np.sin(z) * np.cos(q), np.cos(z)])
+        seen /= np.linalg.norm(seen, axis=1)[:, None]
+        seen, middle = (lifted(s, zenith, constant * radian) for s in (seen, np.array([[0.0, 0.0, 1.0]])))
+        place = seen[:, :2] / seen[:, 2:] - middle[:, :2] / middle[:, 2:]  # the telescope points at what it sees
+        xy = place / away + SIZE / 2 + rng.normal(0, sigma, (n_stars, 2))
+        on = np.all((xy > 0) & (xy < SIZE - 1), axis=1)
+        part = QTable({"exposure": [f"e{i:02d}"] * on.sum(), "star": np.flatnonzero(on)})
+        part["x"], part["y"] = xy[on].T * u.pix
+        part["x_err"] = part["y_err"] = np.full(on.sum(), sigma) * u.pix
+        part["tan_z"], part["parallactic_angle"] = np.tan(z), np.degrees(q) * u.deg
+        rows.append(part)
+    plane = np.array([[-1.0, 0.0, SIZE / 2], [0.0, 1.0, -SIZE / 2]]) / 3600
+    return ld.Matches.from_table(vstack(rows), shape=(SIZE, SIZE), sky=TangentPlane(80.0, -30.0, plane))
+
+
+@pytest.mark.filterwarnings("ignore::legdistort.exceptions.LegdistortWarning")
+def test_refraction_over_a_wide_field():
+    """Exposures with poses alone, stars lifted by turns in space: with the term errors are those of no refraction."""
+    how = {"degree": 3, "static": "fit", "exposure_degree": 0, "clip": None}
+    bent, free = wide(21, 58.0), wide(21, 0.0)
+    plain, found, none = (
+        ld.solve(matches, **how, terms=terms)
+        for matches, terms in ((bent, ()), (bent, "differential_refraction"), (free, "differential_refraction"))
+    )
+    assert plain.chi2 / plain.dof > 100
+    assert found.chi2 / found.dof == pytest.approx(1, abs=0.1)
+    (row,) = found.terms
+    assert row["value"] == pytest.approx(58.0, abs=4 * row["error"])
+    assert row["error"] < 0.3
+    assert "differential_refraction: the positions do not show it" in str(none)
+    assert np.median(found.stars["x_err"]) < 1.2 * np.median(none.stars["x_err"])
+
+
+def test_refraction_over_a_field_needs_a_sky():
+    with pytest.raises(InputError, match="differential_refraction needs to know where on the sky"):
+        sky(7).solve(terms="differential_refraction")
 
 
 HEADER = {"RA": 80.0, "DEC": -69.0, "DATE-OBS": "2015-01-10T03:00:00"}

@@ -3,6 +3,7 @@
 import numpy as np
 from astropy import units as u
 
+from ...exceptions import InputError
 from ...results.motions import accelerated, smooth_paths
 
 #: Waves of the fraction of a pixel.
@@ -26,12 +27,45 @@ def refraction(observed):
 
     The parallactic angle counts from north through east, without a sky from +y of the reference plane towards +x.
     """
-    angle = np.radians(observed.values("parallactic_angle", u.deg))
-    zenith = np.stack([np.sin(angle), np.cos(angle)])
+    zenith = _zenith(observed)
     if observed.sky is not None:
         to_sky = observed.sky.matrix[:, :2] / np.sqrt(abs(np.linalg.det(observed.sky.matrix[:, :2])))
         zenith = np.linalg.inv(to_sky) @ zenith
     return observed.on_detector(observed.values("tan_z") * observed.colour_departure * zenith)[None]
+
+
+def differential_refraction(observed):
+    """What all stars are lifted by more, or less, than those in the middle of their exposure, (1, 2, n).
+
+    By arcseconds of the constant k of the refraction k tan z. A star in the direction s of the zenith Z moves by
+    ``k (Z / Z.s - s)``, at places w on the plane that touches the sky in the middle, in radians, by
+    ``k (1 + w.w) (e tan z - w) / (1 + tan z e.w)``, e the direction of the zenith.
+
+    Raises
+    ------
+    InputError
+        Without a sky.
+    """
+    if observed.sky is None:
+        raise InputError(
+            "term differential_refraction needs to know where on the sky the exposures lie: match frames that have a "
+            "WCS, or give Matches.from_table a sky"
+        )
+    problem, scale = observed.problem, np.radians(observed.sky.matrix[:, :2])
+    w = scale @ problem.placed(observed.state.stars)[:2]
+    n = np.bincount(observed.exposure)
+    tan_z = observed.values("tan_z")
+    (*middle, tan_z) = (np.bincount(observed.exposure, each) / n for each in (*w, tan_z))
+    w, tan_z = w - np.stack(middle)[:, observed.exposure], tan_z[observed.exposure]
+    e = _zenith(observed)
+    lifted = (1 + np.sum(w * w, axis=0)) * (e * tan_z - w) / (1 + tan_z * np.sum(e * w, axis=0))
+    return observed.on_detector(np.radians(1 / 3600) * np.linalg.solve(scale, lifted - e * tan_z))[None]
+
+
+def _zenith(observed):
+    """Its direction, to east and north, or along x and y of the plane where no sky is known, (2, n)."""
+    angle = np.radians(observed.values("parallactic_angle", u.deg))
+    return np.stack([np.sin(angle), np.cos(angle)])
 
 
 def accelerations(observed):

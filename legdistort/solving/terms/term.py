@@ -13,7 +13,7 @@ from ...exceptions import InputError
 from ...inputs.column_contract import colour_column
 from ...results.motions import PATHS
 from ...runtime.checks import check_choice, check_positive
-from .displacements import PIXEL_WAVES, accelerations, orbits, pixel_waves, refraction
+from .displacements import PIXEL_WAVES, accelerations, differential_refraction, orbits, pixel_waves, refraction
 from .random_field import Kernel
 from .rough import RoughColumns, names
 
@@ -102,9 +102,10 @@ class Term:
     def named(cls, name: str, **changed: Any) -> Term | RandomField:
         """A term that the package has, perhaps with attributes changed.
 
-        "refraction", "pixel_phase", "acceleration" (of a star, constant), "orbits" (any smooth path, once round),
-        "rough_static" (what the static distortion of a detector has beyond the degree), "turbulence" (a random field of
-        every exposure, whose attributes are size, length, smoothness, ratio and angle).
+        "refraction" (by the colours of stars), "differential_refraction" (over the field), "pixel_phase",
+        "acceleration" (of a star, constant), "orbits" (any smooth path, once round), "rough_static" (what the
+        static distortion of a detector has beyond the degree), "turbulence" (a random field of every exposure, whose
+        attributes are size, length, smoothness, ratio and angle).
 
         Raises
         ------
@@ -248,6 +249,8 @@ FIELD_NUMBERS = "size", "length", "smoothness", "axis ratio", "angle"
 TERMS = {
     "refraction": Term("refraction", refraction, ("towards zenith",), unit="pix per unit of colour",
                        needs=(_COLOUR, *_ZENITH)),
+    "differential_refraction": Term("differential_refraction", differential_refraction, ("constant",), unit="arcsec",
+                                    needs=_ZENITH),
     "acceleration": Term("acceleration", accelerations, PATHS["acceleration"][0], unit="pix/yr2", owner="star",
                          each=True, needs=("epoch",)),
     "orbits": Term("orbits", orbits, PATHS["orbits"][0], owner="star", each=True, needs=("epoch",)),
