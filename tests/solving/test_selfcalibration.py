@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from astropy.table import vstack
+from astropy import units as u
+from astropy.table import QTable, vstack
 from caller_warnings import warns_here
 from numpy.testing import assert_allclose
+from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import least_squares
 
 from legdistort import Camera, Detector, Matches, Prior, Solution, solve
@@ -308,3 +310,36 @@ def test_three_words_for_one_detector():
 def test_words_that_make_no_sense(given, message):
     with pytest.raises(InputError, match=message):
         solve(camera(n_stars=60).matches, **given)
+
+
+@pytest.mark.parametrize(("noise", "left"), [(10.0, 6.5), (20.0, 13.0)])
+def test_the_optics_of_an_imager_come_back_from_a_mask(shared_data, noise, left):
+    """The design of MAVIS (MAVISIM), 40 x 40 pinholes in three exposures 0.3 mm apart; errors in microarcseconds."""
+    size, mas, per_mm = 4076, 7.36, 1000 / 582 / 0.00736
+    path = shared_data / "static_distortion" / "mavis_smooth" / "mavisim_static.txt"
+    table = np.loadtxt(path, skiprows=2)
+    nodes = np.unique(np.round(table[:, 2], 6))
+    scale = np.ptp(table[:, 0]) * 3600 / np.ptp(table[:, 4]) / (mas / 1000)  # pixels a millimetre
+    grid = (table[:, 6:8] - table[:, 4:6]).T.reshape(2, len(nodes), len(nodes)) * scale  # along x first
+
+    def seen(q):
+        u_, v = (2 * q / (size - 1) - 1).T
+        return q + np.stack([RectBivariateSpline(nodes, nodes, each).ev(u_, v) for each in grid], axis=1)
+
+    rng, line = np.random.default_rng(1), (np.arange(40) - 19.5) * 0.5 * per_mm + (size - 1) / 2
+    holes = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) + rng.normal(0, 0.3, (1600, 2))
+    sigma, parts = noise / 1000 / mas, []
+    for i, shift in enumerate([(0, 0), (1, 0), (0, 1)]):
+        q = holes + 0.3 * per_mm * np.array(shift)
+        on = np.all((q > 5) & (q < size - 6), axis=1)
+        part = QTable({"exposure": [f"m{i}"] * on.sum(), "star": np.flatnonzero(on)})
+        part["x"], part["y"] = (seen(q[on]) + rng.normal(0, sigma, (on.sum(), 2))).T * u.pix
+        part["x_err"] = part["y_err"] = np.full(on.sum(), sigma) * u.pix
+        parts.append(part)
+    with warns_here(AssumptionWarning, match="unknowns of the shared distortion are not determined"):
+        matches = Matches.from_table(vstack(parts), shape=(size, size))
+        solution = solve(matches, degree=5, static="fit", exposure_degree=0, clip=None)
+    assert solution.chi2 / solution.dof == pytest.approx(1, abs=0.06)
+    q = rng.uniform(0.02 * size, 0.98 * size, (2000, 2))
+    q = q[np.hypot(*(q - (size - 1) / 2).T) < 13 / 30 * size]
+    assert 1000 * mas * np.std(without_affine(solution["m0"].correct(seen(q)) - q, q)) < left
