@@ -34,7 +34,7 @@ _EXACT = 1e-12  # px^2: what counts as known without error
 #: Beginnings of a search for the majority; a median pull, in those expected, up to which chance explains it.
 _STARTS, _BEST, _USUAL = 100, 10, 1.3
 #: Stars among which that search begins; the best beginnings go on with all.
-_FIRST = 600
+_FIRST = 300
 #: Mismatches from which their share tells from which pull an offset is one, and the least of these.
 _SEVERAL, _LEAST = 3, 3.0
 _SQRT = np.sqrt(2 * np.log(2))  # median of the length of a normal vector in two dimensions

@@ -8,6 +8,7 @@ since nothing else tells them from it.
 """
 
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from scipy.spatial import cKDTree
 from ...geometry.tabulated.covariance_table import CovarianceTable
 from ...geometry.tabulated.displacement_table import MARGIN, DisplacementTable
 from ...results.errors.absolute_errors import variances
+from ...runtime.parallel import n_cores
 from ..equations.star_terms import unpacked
 from .displaced import Tabled, displaced, taken_off
 from .observed import undistorted
@@ -34,6 +36,7 @@ _LEAST, _ROUNDS, _SMALL = 30, 4, 0.1
 _CELLS, _CELLS_A_STAR, _MOST_CELLS, _FINER = 4, 1.2, 128, 2
 #: Sizes by the scatter of the offsets, lengths by the extent of the stars, factors on variances.
 _SIZES, _LENGTHS, _FACTORS = (1e-2, 10.0), (1e-3, 1.0), (0.05, 20.0)
+_STEP = 1e-4  # of their logarithms, by which slopes are taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +94,16 @@ class FieldOfOne:
         near = cKDTree(stars).query(where[groups].mean(axis=1), k=told)[1].reshape(len(groups), told)
         field, covariance = np.empty((len(where), 2)), np.empty((len(where), 2, 2))
         alone = kernel.blocks(np.zeros(1), np.zeros(1))[0]
-        for first in range(0, len(groups), _AT_ONCE):
+
+        def fill(first):
             rows, seen = (each[first : first + _AT_ONCE] for each in (groups, near))
             inner, cross = _covariances(kernel, stars[seen], where[rows], self.noise[seen])
             weights = np.linalg.solve(inner, cross.reshape(*inner.shape[:2], -1)).reshape(cross.shape)
             field[rows] = np.einsum("nkma,nk->nma", weights, self.offsets[seen].reshape(len(cross), -1))
             covariance[rows] = alone - np.einsum("nkma,nkmb->nmab", weights, cross)
+
+        with ThreadPoolExecutor(n_cores()) as threads:
+            list(threads.map(fill, range(0, len(groups), _AT_ONCE)))
         return field, covariance
 
 
@@ -156,18 +163,25 @@ def field_in(places, offsets, noise):
         def read(x):
             return Kernel(*np.exp(x[:2]), nu, tuple(x[4:]) if len(x) > 4 else (0.0, 0.0)), np.exp(x[2:4])
 
+        def with_slope(x):
+            values = np.array(
+                list(threads.map(lambda y: deviance(*read(y), targets), [x, *(x + _STEP * np.eye(len(x)))]))
+            )
+            return values[0], (values[1:] - values[0]) / _STEP
+
         ranges = scatter * np.array(_SIZES), extent * np.array(_LENGTHS), np.array(_FACTORS), np.array(_FACTORS)
         bounds = [np.log(each) for each in ranges] + [(-4, 4)] * (len(x0) - 4)
-        made = minimize(lambda x: deviance(*read(x), targets), x0, method="L-BFGS-B", bounds=bounds,
-                        options={"ftol": 1e-6, "maxiter": 20, "eps": 1e-4})  # fmt: skip
+        made = minimize(with_slope, x0, jac=True, method="L-BFGS-B", bounds=bounds,
+                        options={"ftol": 1e-6, "maxiter": 20})  # fmt: skip
         return made.fun, made.x, *read(made.x)
 
     first = min(_GIVEN, n - 1)
     few, many = (np.linspace(first, n - 1, min(count, n - first)).astype(int) for count in (_FEW, _MANY))
     x0 = np.array([np.log(scatter / 1.5), np.log(extent / 10), -0.7, -0.7])
-    nu, best = min(((nu, sought(nu, x0, few)) for nu in _SMOOTHNESS), key=lambda each: each[1][0])
-    plain = sought(nu, best[1], many)
-    drawn = sought(nu, np.append(plain[1], [0.1, 0.1]), many)
+    with ThreadPoolExecutor(n_cores()) as threads:
+        nu, best = min(((nu, sought(nu, x0, few)) for nu in _SMOOTHNESS), key=lambda each: each[1][0])
+        plain = sought(nu, best[1], many)
+        drawn = sought(nu, np.append(plain[1], [0.1, 0.1]), many)
     cost, _, kernel, factors = drawn if plain[0] - drawn[0] > DRAWN_OUT else plain
     factors = tuple(np.sqrt(factors).tolist())
     return FieldOfOne(places, offsets, _times(noise, factors), Found(kernel, nothing(many) - cost), factors)
