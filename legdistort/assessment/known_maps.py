@@ -1,6 +1,5 @@
 """What is known of the static distortions of detectors, from a map, a camera or a night, with its covariance."""
 
-import hashlib
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,7 +33,6 @@ _NOTHING, _FREE = 1e4, 1e3  # error of a coefficient of which nothing is known, 
 _ROUNDS = 3
 _KEPT = "loss", "motion", "motion_sigma", "motion_epoch", "night_sigma"  # settings of a night
 _MOST = 500  # coefficients from which the scatter of exposures is found
-_HASHES = 8  # positions of an exposure that are kept
 _LARGER = 1.1  # sizes, by which a derivative is taken
 
 
@@ -43,23 +41,6 @@ def chance(chi2, k, dof):
     if not k:
         return 1.0
     return float(special.fdtrc(k, dof, chi2 / k) if np.isfinite(dof) else special.chdtrc(k, chi2))
-
-
-def fingerprints(solution):
-    """Of the positions that were measured in every exposure, ``{exposure: texts}``: those with the smallest hashes.
-
-    So some are the same if other stars of it were matched.
-    """
-    table = solution.residuals
-    name, x, y = (np.asarray(getattr(table[c], "value", table[c])) for c in ("exposure", "x", "y"))
-    out = {}
-    for exposure in solution.names:
-        mine = name == exposure
-        hashes = sorted(
-            hashlib.sha256(f"{a:.6f} {b:.6f}".encode()).hexdigest()[:12] for a, b in zip(x[mine], y[mine], strict=True)
-        )
-        out[exposure] = tuple(hashes[:_HASHES])
-    return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from scipy import special
 from ..cameras.camera import Camera
 from ..exceptions import InputError, some_of
 from ..geometry import basis, detector_modes
+from ..inputs.repetitions import fingerprints
 from ..inputs.table_files import records
 from ..plots.difference_plots import plot_difference
 from ..priors.from_objects import SKY
@@ -25,7 +26,7 @@ from ..runtime.asdf_files import entry_of
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from .camera_memory import CombinedNights
-from .known_maps import DETERMINED, MEAN_SQUARE, chance, fingerprints, known_map, pointed
+from .known_maps import DETERMINED, MEAN_SQUARE, chance, known_map, pointed
 from .star_difference import StarDifference, compare_stars, shared_exposures
 
 if TYPE_CHECKING:
@@ -330,7 +331,7 @@ def _shared(first, second):
 def _measured(thing):
     """Fingerprints of what was measured, by exposure or by night; of maps none."""
     if isinstance(thing, Solution):
-        return fingerprints(thing)
+        return fingerprints(thing.residuals)
     return {each.name: each.exposures for each in thing.nights} if isinstance(thing, CombinedNights) else {}
 
 

@@ -10,10 +10,11 @@ from astropy import units as u
 from ..exceptions import InputError
 from ..geometry import basis, detector_modes
 from ..inputs import column_contract
+from ..inputs.repetitions import fingerprints
 from ..priors.prior import Prior
 from ..results.solution import Solution
 from ..runtime.trees.facts import array, number
-from .known_maps import fingerprints, pointed, shown_by, sound
+from .known_maps import pointed, shown_by, sound
 
 #: Error of a coefficient [pix] of a map that states none: that of a header as `legdistort attach` writes it.
 EXACT = 1e-3
@@ -78,7 +79,7 @@ class Night:
         counts["n_nights"] = 1 if shown.nightly is None else int(np.count_nonzero(~nights["odd"]))
         date = float(np.mean(column_contract.values(table, "epoch", u.yr))) if "epoch" in table.colnames else None
         odd = tuple(str(each) for each in nights["name"][nights["odd"]])
-        measured, used = fingerprints(solution), set(table["exposure"])
+        measured, used = fingerprints(solution.residuals), set(table["exposure"])
         marks = tuple(mark for each in solution.names if each in used for mark in measured[each])
         return cls(name, date=date, odd=odd, exposures=marks, **counts, **given)
 

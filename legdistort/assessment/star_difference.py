@@ -15,11 +15,10 @@ from ..exceptions import InputError
 from ..geometry import basis
 from ..geometry.similarity import apply, fit_similarity
 from ..inputs import column_contract
-from ..inputs.references.catalogue import Reference
+from ..inputs.repetitions import fingerprints
 from ..inputs.table_files import records
-from ..matching.cross_identification import identify
+from ..matching.cross_identification import same_stars
 from ..results import in_tables
-from .known_maps import fingerprints
 
 #: Stars that are named, those that differ most.
 NAMED = 5
@@ -146,8 +145,8 @@ class StarDifference:
 
 def shared_exposures(first, second):
     """Names, in the second of two solutions, of exposures that both have: measured alike, or anew in the same frame."""
-    known = {mark for marks in fingerprints(first).values() for mark in marks}
-    same = {name for name, marks in fingerprints(second).items() if known & set(marks)}
+    known = {mark for marks in fingerprints(first.residuals).values() for mark in marks}
+    same = {name for name, marks in fingerprints(second.residuals).items() if known & set(marks)}
     one, two = _seen(first), _seen(second)
     for name in (one.keys() & two.keys()) - same:
         (xy, year), (again, other) = one[name], two[name]
@@ -177,7 +176,7 @@ def compare_stars(first, second, *, shared):
     one, two, year = _at_one_time(first, second)
     counts = len(one), len(two)
     try:
-        rows = _same_stars(one, two)
+        rows = same_stars(_places(one), _places(two), "the second solution")
     except InputError:
         return None
     one, two = one[rows[0]], two[rows[1]]
@@ -227,21 +226,9 @@ def _placed(stars):
     return np.isfinite(stars["vx"].value) if "vx" in stars.colnames else np.ones(len(stars), bool)
 
 
-def _same_stars(one, two):
-    """Rows of the stars that are the same, by name where these lie alike, else by their places."""
-    xy, flux = _xy(two), np.asarray(two["flux"]) if "flux" in two.colnames else None
-    known = np.flatnonzero(np.isfinite(xy).all(axis=1))
-    flux = None if flux is None else flux[known]
-    nothing = np.zeros((len(known), 2, 0))  # which lets the plane be turned
-    reference = Reference("the second solution", np.asarray(two["star"])[known], flux, None, xy[known],
-                          np.zeros((len(known), 2, 2)), maps=nothing)  # fmt: skip
-    own = _xy(one), np.asarray(one["flux"]) if "flux" in one.colnames else None
-    try:
-        found = identify(reference, np.asarray(one["star"]), own[0])
-    except InputError:
-        reference = Reference("the second solution", None, flux, None, xy[known], reference.covariance, maps=nothing)
-        found = identify(reference, np.asarray(one["star"]), own[0], flux=own[1])
-    return found.rows, known[cKDTree(xy[known]).query(found.xy)[1]]
+def _places(stars):
+    """Names, positions and fluxes of a table of stars, as `same_stars` takes them."""
+    return np.asarray(stars["star"]), _xy(stars), np.asarray(stars["flux"]) if "flux" in stars.colnames else None
 
 
 def _offsets(values, xy, field, errors, degree, shared):

@@ -216,7 +216,8 @@ def do_solve(a):
         check_results(a.out, a.overwrite)  # again: nobody else writes there any more
         matches, inputs = read_matches(a)
         with timed({}, "solve"):
-            solution = legdistort.solve(matches, **_solving(a, matches), progress=wants_progress(a))
+            asked = given(a, options.BASE) | _solving(a, matches)
+            solution = legdistort.solve(matches, **asked, progress=wants_progress(a))
         solution = provenance.with_inputs(solution, inputs)
         with timed({}, "assess"):
             summary = summarise(solution)

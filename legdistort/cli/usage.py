@@ -85,6 +85,7 @@ COMMANDS = {
         "matched.ecsv --degree 2 --out results",
         options.MATCHED,
         options.LEFT_OUT,
+        options.BASE,
         options.STRICT,
         options.out("folder for the results", path="results"),
         options.TABLE,

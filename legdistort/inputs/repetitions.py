@@ -1,5 +1,7 @@
 """The same exposure twice, under two names: its positions agree to the last bit, which two measurements never do."""
 
+import hashlib
+
 import numpy as np
 
 from ..exceptions import AssumptionWarning, reasons_of, warn
@@ -9,6 +11,7 @@ FEWEST = 5
 #: From so many positions on in every exposure an eighth of them is looked at first; that none of the positions of a
 #: copy is among them happens once in 10^11 times, if they have values of x of their own.
 _MANY = 400
+_HASHES = 8  # positions of an exposure that its fingerprint has
 
 
 def copies(exposure, xy):
@@ -70,3 +73,19 @@ def warned(repeated):
     if repeated:
         warn(f"the same exposure more than once, which counts as one: {reasons_of(repeated)}", AssumptionWarning)
     return repeated
+
+
+def fingerprints(table):
+    """Of the positions that were measured in every exposure, ``{exposure: texts}``: those with the smallest hashes.
+
+    So some are the same if other stars of it were matched.
+    """
+    name, x, y = (np.asarray(getattr(table[c], "value", table[c])) for c in ("exposure", "x", "y"))
+    out = {}
+    for exposure in dict.fromkeys(name.tolist()):
+        mine = name == exposure
+        hashes = sorted(
+            hashlib.sha256(f"{a:.6f} {b:.6f}".encode()).hexdigest()[:12] for a, b in zip(x[mine], y[mine], strict=True)
+        )
+        out[exposure] = tuple(hashes[:_HASHES])
+    return out

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from ..exceptions import InputError
 from ..geometry import similarity
 from ..geometry.tangent_plane import TangentPlane, angles, directions
+from ..inputs.references.catalogue import Reference
 from .registration import register
 from .similarity_candidates import scale_candidates
 from .star_lists import StarList
@@ -17,6 +18,8 @@ log = logging.getLogger(__name__)
 
 #: Part of the field within which stars that are taken to be the same must agree, once a similarity is taken out.
 _AGREEMENT = 0.05
+#: Part of the stars for which this holds where names are given to both lists alike; numbers by brightness often agree.
+_NAMED_ALIKE = 0.95
 #: Part of the field that the plane of the catalogue may be off.
 _MARGIN = 0.5
 #: Chance that a star which is near by accident is taken for a reference star.
@@ -94,25 +97,70 @@ def identify(reference, names, positions, *, flux=None, sky=None, pixel_scale=No
     solved = np.isfinite(positions).all(axis=1)
     rows = np.flatnonzero(solved)
     flux = None if flux is None else flux[rows]
-    if reference.star is not None:
-        mine, theirs = _by_name(reference, names[rows])
-    elif reference.xy is None and sky is None:
-        mine, theirs = _by_pattern(reference, positions[rows], flux, pixel_scale)
-    else:
-        try:
-            mine, theirs = _on_plane(reference, reference.on_plane(sky).xy, positions[rows], flux)
-        except InputError:  # the plane of a solution of its own
-            is_own = reference.maps is not None and reference.xy is not None
-            found = _turned(reference, positions[rows], flux) if is_own else None
-            if found is None:
-                raise
-            (mine, theirs), sky = found, None
+    mine, theirs, sky = _pairs(reference, names[rows], positions[rows], flux, sky, pixel_scale)
     rows, reference = rows[mine], reference.subset(theirs)
     if reference.xy is None and sky is None:
         sky = _tangent_plane(reference, positions[rows])
     found = reference.on_plane(sky)
     _check_agreement(reference.label, positions[rows], found.xy, np.ptp(positions[solved], axis=0).max())
     return Identified(rows, found.xy, found.covariance, sky, found.motion, found.maps, found.unknown)
+
+
+def _pairs(reference, names, positions, flux, sky, pixel_scale):
+    """Rows of the stars and of the reference that are the same, and the sky as far as it holds for these."""
+    if reference.star is not None:
+        return *_by_name(reference, names), sky
+    if reference.xy is None and sky is None:
+        return *_by_pattern(reference, positions, flux, pixel_scale), sky
+    try:
+        return *_on_plane(reference, reference.on_plane(sky).xy, positions, flux), sky
+    except InputError:  # the plane of a solution of its own
+        is_own = reference.maps is not None and reference.xy is not None
+        found = _turned(reference, positions, flux) if is_own else None
+        if found is None:
+            raise
+        return *found, None
+
+
+def same_stars(one, two, label):
+    """Rows of the stars that two lists have in common: by name where these lie alike, else by their places.
+
+    Parameters
+    ----------
+    one, two : (names, positions, flux)
+        Arrays (n,), (n, 2) [pix, each on a plane of its own] and (n,), or None; NaN for stars without a position.
+    label : str
+        How messages call the second.
+
+    Returns
+    -------
+    ndarray of int, ndarray of int
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    (rows, own), (others, known) = _of_known_places(*one), _of_known_places(*two)
+    names, xy, flux = known
+    plane = {"covariance": np.zeros((len(xy), 2, 2)), "maps": np.zeros((len(xy), 2, 0))}  # which may be turned
+    named = Reference(label, names, flux, None, xy, **plane)
+    size = np.ptp(own[1], axis=0).max(initial=0.0)
+    try:
+        mine, theirs = _by_name(named, own[0])
+        _check_agreement(label, own[1][mine], xy[theirs], size, _NAMED_ALIKE)
+        by_name = 2 * len(mine) > min(len(own[0]), len(names))
+    except InputError:
+        by_name = False
+    if not by_name:
+        mine, theirs, _ = _pairs(replace(named, star=None), *own, None, None)
+        _check_agreement(label, own[1][mine], xy[theirs], size)
+    return rows[mine], others[theirs]
+
+
+def _of_known_places(names, positions, flux):
+    rows = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    return rows, (names[rows], positions[rows], None if flux is None else flux[rows])
 
 
 def _by_name(reference, names):
@@ -218,14 +266,15 @@ def _tangent_plane(reference, positions):
     return TangentPlane(plane.lon, plane.lat, similarity.robust_similarity(positions, reference.on_plane(plane).xy))
 
 
-def _check_agreement(label, positions, xy, size):
-    """Raise `InputError` if a similarity does not carry one to the other, roughly."""
+def _check_agreement(label, positions, xy, size, share=0.5):
+    """Raise `InputError` if a similarity does not carry that share of one to the other, roughly."""
     if len(positions) < 3:
         return
     off = np.hypot(*(similarity.apply(similarity.robust_similarity(positions, xy), positions) - xy).T)
-    if not np.median(off) < _AGREEMENT * size:
+    typical = np.quantile(off, share)
+    if not typical < _AGREEMENT * size:
         raise InputError(
             f"the {len(positions)} stars that {label} shares with the exposures by name do not lie as they do there "
-            f"({np.median(off):.0f} px off, whatever shift, rotation and scale): other stars under the same names? "
+            f"({typical:.0f} px off, whatever shift, rotation and scale): other stars under the same names? "
             "Without the column star they are matched by position"
         )

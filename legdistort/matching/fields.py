@@ -94,12 +94,11 @@ def joined(parts):
     known |= {"camera": first.camera if first.camera.is_known else None}
     known["pointing"] = first.pointing if same["sky"] else None
     known["header_distortion"] = next((p.header_distortion for p in parts.values() if p.header_distortion), None)
-    _warn_of_lost_columns(dict(zip(parts, tables, strict=True)))
-    return vstack(tables, join_type="inner", metadata_conflicts="silent"), known
+    return stacked(dict(zip(parts, tables, strict=True))), known
 
 
-def _warn_of_lost_columns(tables):
-    """Warn of columns that not all tables of fields have, ``{name of the field: table}``."""
+def stacked(tables):
+    """One table of several, ``{what it is of: table}``, with the columns that all have; warns of others."""
     lost = {}
     for name in dict.fromkeys(name for table in tables.values() for name in table.colnames):
         lacking = [label for label, table in tables.items() if name not in table.colnames]
@@ -107,4 +106,5 @@ def _warn_of_lost_columns(tables):
             lost.setdefault(tuple(lacking), []).append(name)
     if lost:
         named = "; ".join(f"{', '.join(names)} (not in {some_of(lacking, 3)})" for lacking, names in lost.items())
-        warn(f"columns that not all fields have are left out: {named}; add them there to keep them", AssumptionWarning)
+        warn(f"columns that not all tables have are left out: {named}; add them there to keep them", AssumptionWarning)
+    return vstack(list(tables.values()), join_type="inner", metadata_conflicts="silent")

@@ -93,6 +93,14 @@ class Observations:
         return bool(np.all(key[1:] > key[:-1]))
 
     @cached_property
+    def flux(self) -> np.ndarray | None:
+        """Mean flux of every star, (n_stars,); None without the column."""
+        if "flux" not in self.table.colnames:
+            return None
+        flux = np.nan_to_num(column_contract.values(self.table, "flux"))
+        return np.bincount(self.star, flux, len(self.stars)) / np.bincount(self.star, minlength=len(self.stars))
+
+    @cached_property
     def fields(self) -> np.ndarray:
         """Number of the group of every exposure that has common stars, directly or through others, (n_exposures,)."""
         n = len(self.names)
@@ -191,6 +199,9 @@ class Matches(ShownAsPrinted):
         a solution starts.
     pointing : HeaderPointing or None
         How well headers tell where the plane lies on the sky, where they put it there.
+    start : dict or None
+        ``{exposure: (2, n_modes)}``: distortions with which a solution begins, pixels, normalised Legendre modes, in
+        the place of those of a prior; files do not keep them.
 
     See Also
     --------
@@ -218,6 +229,7 @@ class Matches(ShownAsPrinted):
     camera: Camera = field(default=None, metadata={READ: Camera.from_meta})
     pose_sigma: dict[str, float] | None = None
     pointing: HeaderPointing | None = field(default=None, metadata={READ: HeaderPointing.of_meta})
+    start: dict[str, np.ndarray] | None = field(default=None, metadata={BY_EXPOSURE: True})
 
     def __post_init__(self) -> None:
         if self.camera is None:
@@ -357,7 +369,7 @@ class Matches(ShownAsPrinted):
     def _by_exposure(self, names):
         """Fields that have an entry for every exposure, with those of these only."""
         found = {each.name: getattr(self, each.name) for each in fields(self) if each.metadata.get(BY_EXPOSURE)}
-        return {key: {name: value[name] for name in names} for key, value in found.items()}
+        return {key: value and {name: value[name] for name in names} for key, value in found.items()}
 
     def to_meta(self) -> dict[str, Any]:
         """All that is known beside the table as plain lists, for the header of a table file; see `read_meta`."""
@@ -515,7 +527,7 @@ class Matches(ShownAsPrinted):
 
 def _beside_the_table():
     """Fields of `Matches` that a file has in the header of its table."""
-    return [each for each in fields(Matches) if each.name not in ("table", "observations")]
+    return [each for each in fields(Matches) if each.name not in ("table", "observations", "start")]
 
 
 def _plain(value):
@@ -672,5 +684,6 @@ def alone(name, more=""):
     """The `MatchError` that there is one exposure, and nothing to compare it with."""
     return MatchError(
         f"only one exposure ({name}): the distortion is found from the differences between exposures, or from a "
-        f"catalogue; give two of the same field at least, or reference= (--reference){more}"
+        "catalogue; give two of the same field at least, or reference= (--reference), or the solution that it is to "
+        f"come into: base= (--base){more}"
     )

@@ -29,6 +29,7 @@ from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, validation
 from .equations import effective_modes
 from .gauge import known_poses
+from .knowledge.base_solution import with_base
 from .knowledge.static_departure import static_departures
 from .motion_choice import resolve as resolve_motion
 from .options import CLIP, DEGREE, SolveOptions, Unasked, check_detectors, check_tie, prior_as_asked, with_stated
@@ -53,9 +54,11 @@ log = logging.getLogger(__name__)
 
 
 @plain_numbers
+@with_base
 def solve(
     matches: Matches,
     *,
+    base: Solution | StrPath | None = None,
     degree: int | str = DEGREE,
     prior: Prior | Mapping[str, Prior] | None = None,
     model: Model | None = None,
@@ -93,6 +96,12 @@ def solve(
     Parameters
     ----------
     matches : Matches
+    base : Solution or path, optional
+        A finished solution, its file or folder, that the exposures of `matches` come into: of one of its fields or of
+        its camera, a single one too. Their stars are found among its own, whose names and plane stay; of stars that it
+        does not have those join that two of the exposures see. All are solved together, so that the old ones move as
+        far as the new ones tell. The options of the base hold but for those that are given; a `prior`, `model` or
+        `reference` that it had is to be given again. What came in when is in ``provenance["added"]``.
     degree : int or "auto"
         Total degree of the Legendre series, 0 to 30; or the one up to 6 whose distortions serve stars best that are
         left out of the fit (`legdistort.solving.choices.degree_choice`). 3 if neither it nor a `model` is given.

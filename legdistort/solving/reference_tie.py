@@ -20,7 +20,6 @@ from scipy.linalg import block_diag
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import similarity
 from ..geometry.similarity import robust_similarity
-from ..inputs import column_contract
 from ..matching.cross_identification import identify
 from ..results.diagnostics import UsedReference
 from ..results.errors.absolute_errors import plain_directions, variances
@@ -483,7 +482,7 @@ def _identified(fit, reference, pixel_scale):
         reference,
         matches.stars,
         np.where(fit.blocks.v[0] > 0, fit.result.state.positions, np.nan).T,
-        flux=_flux(matches),
+        flux=matches.observations.flux,
         sky=matches.sky,
         pixel_scale=pixel_scale,
     )
@@ -540,15 +539,6 @@ def _held_back(fit, problem):
     if shared is not None:
         out["shared_errors"] = variances(follow @ unpacked(shared) @ follow.transpose(0, 2, 1))
     return out
-
-
-def _flux(matches):
-    """Mean flux of every star, or None."""
-    if "flux" not in matches.table.colnames:
-        return None
-    star = matches.observations.star
-    flux = np.nan_to_num(column_contract.values(matches.table, "flux"))
-    return np.bincount(star, flux, len(matches.stars)) / np.bincount(star, minlength=len(matches.stars))
 
 
 def used_reference(fit, reference):

@@ -1,6 +1,7 @@
 """Start values of a minimisation, and exposures that are too far off to take part in one."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,7 +18,7 @@ _ENOUGH = 300
 
 
 def start(problem, nominal, *, robust=False):
-    """Start values: coefficients at the prior mean, poses refined to one another, positions their weighted mean.
+    """Start values: coefficients where they begin, by default at the prior mean, poses refined to one another, positions their weighted mean.
 
     Parameters
     ----------
@@ -39,7 +40,8 @@ def start(problem, nominal, *, robust=False):
         If the prior cannot be inverted at the observed positions.
     """
     _check_prior(problem)
-    q = undistorted(problem)
+    begun = problem.prior_mean if problem.begun is None or problem.fixed is not None else problem.begun
+    q = undistorted(replace(problem, prior_mean=begun))
     full = problem.weight[:2].sum(axis=0) / 2
     current, weight = np.array(nominal, dtype=float), full
     n_sweeps = 12 if robust else 1
@@ -63,7 +65,7 @@ def start(problem, nominal, *, robust=False):
         stars = moving_stars(problem, current, q, weight)
     else:
         stars = similarity.apply_each(similarity.invert(common)[problem.field_of_stars], positions.T).T
-    return State(stars, problem.prior_mean.copy(), current), typical
+    return State(stars, begun.copy(), current), typical
 
 
 def _some(values):

@@ -75,6 +75,8 @@ class Problem:
         Group of exposures with common stars that every exposure is in, directly or through others.
     moving : StarTerms or None
         How stars move from exposure to exposure; None: they do not.
+    begun : ndarray, shape (n_exposures, 2, n_all), or None
+        Coefficients with which a minimisation begins; None: those of the prior mean.
     weak : float
         Eigenvalue of the normalised equations below which a distortion that exposures share is held.
     """
@@ -101,6 +103,7 @@ class Problem:
     pose_width: np.ndarray | None = None
     field: np.ndarray | int = 0
     moving: StarTerms | None = None
+    begun: np.ndarray | None = None
     weak: float = 1e-3
 
     @cached_property
@@ -408,11 +411,21 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
         night=matches.blocks,
         field=matches.fields,
         night_sigma=night_sigma,
+        begun=_begun(matches, mean, n_fit),
         **_known_poses(matches, degree, np.bincount(obs.exposure[order], weight[:2].mean(axis=0))),
     )
     if motion is None:
         return problem
     return replace(problem, moving=motion(matches, problem.in_table_order(weight[:2].mean(axis=0))))
+
+
+def _begun(matches, mean, n_modes):
+    """The coefficients that matches state for a start, the modes that are not fitted as in the prior mean; or None."""
+    if matches.start is None:
+        return None
+    begun, degree = mean.copy(), basis.degree_of(n_modes)
+    begun[:, :, :n_modes] = [basis.change_degree(matches.start[name], degree) for name in matches.names]
+    return begun
 
 
 def _known_poses(matches, degree, weight):

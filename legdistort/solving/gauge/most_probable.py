@@ -147,7 +147,8 @@ def counts(problem, state, shown=1.0):
     squares = np.sum(departures**2, axis=1)
     if np.mean(squares) <= limit:
         return False
-    own = known.others @ conditional_errors(criterion.linearise(problem, state).u_data) @ known.others.mT
+    whole = replace(problem, prior_mean=_padded(problem.prior_mean, state))  # what they have in common beyond the degree
+    own = known.others @ conditional_errors(criterion.linearise(whole, state).u_data) @ known.others.mT
     noise, chance = np.einsum("ikk->i", own), np.sqrt(2 * np.einsum("ikl,ikl->i", own, own))
     seen = squares > noise + _SEEN * chance  # an exposure that is worth little departs far for nothing
     return bool(np.sum((squares - noise)[seen]) > limit * problem.n_exposures)

@@ -1,0 +1,79 @@
+"""A finished solution that further exposures come into."""
+
+from dataclasses import fields, replace
+from functools import wraps
+from pathlib import Path
+
+from ...exceptions import InputError
+from ...inputs.repetitions import fingerprints
+from ...matching.further_exposures import with_further
+from ...results.settings import Settings
+from ...results.solution import Solution
+from ...runtime.provenance import now
+
+#: Settings that are no arguments of `legdistort.solve`, or none that are kept in full.
+_NOT_KEPT = {"prior", "model", "method", "gauge"}
+
+
+def with_base(solve):
+    """`legdistort.solve` with its argument `base`: what it solves then is all, with the options of the base."""
+
+    @wraps(solve)
+    def extended(matches, *, base=None, **given):
+        if base is None:
+            return solve(matches, **given)
+        before = _opened(base)
+        _check(before, given)
+        whole = with_further(before, matches)
+        asked = {name: value for name, value in given.items() if name not in _NOT_KEPT or value is not None}
+        solution = solve(whole, **_options(before) | asked)
+        return replace(solution, provenance=solution.provenance | _log(before, matches))
+
+    return extended
+
+
+def _opened(base):
+    if isinstance(base, Solution):
+        return base
+    if isinstance(base, (str, Path)):
+        return Solution.read(base)
+    raise InputError(f"base must be a Solution, its file or its folder, got {type(base).__name__}")
+
+
+def _check(base, given):
+    """Raise `InputError` for a base that is not kept as it was asked for, with what to give again, or instead."""
+    settings = base.settings
+    if base.gauge.plane is not None:
+        raise InputError(f"the base is a simpler correction ({base.gauge.kind}): give a solution of legdistort.solve")
+    for name, why in (
+        ("dynamic", "dynamic='detector' makes exposures of its detectors"),
+        ("validate", "the stars that it kept out of the fit (validate) are not in it"),
+        ("pose_sigma", "the poses that were given with their errors (pose_sigma) are not in it"),
+    ):
+        if getattr(settings, name) not in (None, "focal_plane"):
+            raise InputError(f"nothing can be added to the base, {why}: solve all exposures together")
+    internal = (settings.prior or {}).get("source") == f"camera {base.camera.name}"
+    needed = {
+        "prior": settings.prior is not None and not internal and settings.model is None,
+        "model": settings.model is not None,
+        "reference": base.diagnostics.reference is not None,
+    }
+    for name in needed:
+        if needed[name] and given.get(name) is None:
+            raise InputError(
+                f"the base was solved with a {name}, of which it keeps a description alone: give it again ({name}=, "
+                f"--{name})"
+            )
+
+
+def _options(base):
+    """The arguments of `solve` that the base was made with."""
+    left = _NOT_KEPT | {"degree"} if base.settings.model is not None else _NOT_KEPT  # which a model has
+    return {each.name: getattr(base.settings, each.name) for each in fields(Settings) if each.name not in left}
+
+
+def _log(base, matches):
+    """What files went into the base, and a line for every time that exposures came in."""
+    came = {"created": f"{now()}+00:00", "base": base.checksum, "exposures": fingerprints(matches.table)}
+    known = base.provenance
+    return {"inputs": known.get("inputs", {}), "added": [*known.get("added", []), came]}
