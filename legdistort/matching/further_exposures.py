@@ -4,11 +4,13 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry.distortion import Distortion
-from ..geometry.similarity import robust_similarity
+from ..geometry.similarity import apply, invert, robust_similarity
 from ..inputs.repetitions import copies
+from ..inputs.start_poses import star_means
 from .cross_identification import same_stars
 from .fields import stacked
 from .matches import Matches, Observations
@@ -17,6 +19,8 @@ from .matches import Matches, Observations
 _ADDED = "dx", "dy", "used"
 #: Further exposures that see a star which the solution does not have, from which on it joins.
 _CONFIRMED = 2
+#: Times the typical distance of stars that are the same, within which one is that is nearest to another.
+_FAR = 10.0
 #: Stars from which a pose is found.
 _FEWEST = 3
 
@@ -106,6 +110,7 @@ def _on_its_plane(solution, matches, mean):
     of_field[seen.star] = seen.fields[seen.exposure]
     known, given = (seen.stars, solution.estimate.positions, seen.flux), (own.stars, _places(solution, matches), own.flux)
     found, poses = np.full(len(own.stars), -1), dict(matches.poses)
+    located = np.zeros(len(own.stars), dtype=bool)
     joins = np.bincount(own.star) >= _CONFIRMED
     for number in range(own.fields.max() + 1):
         names = [own.names[i] for i in np.flatnonzero(own.fields == number)]
@@ -113,7 +118,7 @@ def _on_its_plane(solution, matches, mean):
         tried = [_same(given, mine, known, np.flatnonzero(of_field == each)) for each in range(of_field.max() + 1)]
         rows, theirs = max(tried, key=lambda pair: len(pair[0]))
         if len(rows):
-            found[rows] = theirs
+            found[rows], located[mine] = theirs, True
         else:
             joins[mine] = True
             warn(
@@ -121,8 +126,8 @@ def _on_its_plane(solution, matches, mean):
                 "found in it",
                 AssumptionWarning,
             )
-    same = found >= 0
-    poses |= _refined(matches, mean, solution.estimate.positions[found], same)
+    poses |= _refined(matches, mean, solution.estimate.positions[found], found >= 0)
+    same = (found := _more(solution, matches, mean, poses, found, located)) >= 0
     names = own.stars.astype(object)
     names[same] = seen.stars[found[same]]
     names[joins & ~same] = _fresh(seen.stars, own.stars[joins & ~same])
@@ -150,6 +155,32 @@ def _refined(matches, mean, positions, known):
             xy = Distortion(mean[name], matches.shapes[name]).invert(seen.xy[rows])
             poses[name] = robust_similarity(positions[seen.star[rows]], xy)
     return poses
+
+
+def _more(solution, matches, mean, poses, found, located):
+    """Rows of the solution (n_stars,) that stars are, with those that rough positions did not tell; -1 for none.
+
+    Of stars that are `located` (n_stars,) on its plane, by others of the same field.
+    """
+    seen, known, first = matches.observations, solution.estimate.positions, found >= 0
+    if not first.any():
+        return found
+    places = np.empty_like(seen.xy)
+    for i, name in enumerate(seen.names):
+        rows = seen.exposure == i
+        undistorted = Distortion(mean[name], matches.shapes[name]).invert(seen.xy[rows])
+        places[rows] = apply(invert(poses[name]), undistorted)
+    places = star_means(places, seen.star, len(seen.stars))
+    limit = _FAR * np.median(np.hypot(*(places - known[found])[first].T))
+    solved, own = np.flatnonzero(np.isfinite(known).all(axis=1)), cKDTree(places)
+    _, nearest = own.query(known[solved], distance_upper_bound=limit)
+    back = cKDTree(known[solved]).query(places)[1]
+    out = found.copy()
+    for row, star in zip(solved, nearest, strict=True):
+        is_free = star < len(out) and located[star] and not first[star] and row not in found
+        if is_free and solved[back[star]] == row:
+            out[star] = row
+    return out
 
 
 def _detectors(seen):
