@@ -32,10 +32,12 @@ class Night:
         Position angles of the exposures one after the other, degrees.
     sigma : float
         Of the positions [pix].
+    static : float
+        Distortion of the focal plane that all exposures share, as `size` of those that each has [pix].
     """
 
     def __init__(self, seed, *, off=2.5, turn=0.0, dither=80.0, n=9, n_stars=450, rolls=(0.0,), sigma=0.01, size=0.3,
-                 odd=(0.0, 0.0, 0.0)):  # fmt: skip
+                 odd=(0.0, 0.0, 0.0), static=0.0):  # fmt: skip
         rng = np.random.default_rng(seed)
         self.sky = rng.uniform(-60, 2 * MIDDLE + 60, (n_stars, 2))
         flux = 10 ** rng.uniform(3.5, 5.5, n_stars)
@@ -44,6 +46,7 @@ class Night:
         self.wrong[1][2] += odd[2]
         self.places = np.array([_place(corner, np.zeros(2), 0.0) for corner in CORNERS])
         self.stated = np.array([_place(c, *w) for c, *w in zip(CORNERS, *self.wrong, strict=True)])
+        common = np.random.default_rng((seed, 1)).normal(0, static / 2, (10, 2))
         rows, self.exposures, self.focal, self.flux = [], [], [], flux
         for i in range(n):
             shift, angle = rng.uniform(-dither, dither, 2) * (i > 0), np.radians(rolls[i % len(rolls)])
@@ -51,7 +54,7 @@ class Night:
             f = (self.sky - MIDDLE) @ roll.T + MIDDLE + shift
             t = f / MIDDLE - 1
             powers = np.stack([t[:, 0] ** a * t[:, 1] ** b for a in range(4) for b in range(4 - a)], axis=1)
-            f = f + powers @ rng.normal(0, size / 2, (10, 2))
+            f = f + powers @ (common + rng.normal(0, size / 2, (10, 2)))
             self.focal.append(f)
             pointing = rng.normal(0, 3, 2)  # of the header
             for key, place, stated in zip(KEYS, self.places, self.stated, strict=True):

@@ -169,8 +169,12 @@ class Camera(ShownAsPrinted):
     @property
     def is_known(self) -> bool:
         """Whether there is more to it than plain images have: a focal plane, a name, or a static distortion."""
-        static = [np.any(each.static) or each.static_sigma is not None for each in self.detectors.values()]
-        return self.has_focal_plane or self.name != IMAGE or any(static) or list(self.detectors) != ["1"]
+        return self.has_focal_plane or self.name != IMAGE or self.states_static or list(self.detectors) != ["1"]
+
+    @property
+    def states_static(self) -> bool:
+        """Whether anything is known of the static distortion of a detector."""
+        return any(np.any(each.static) or each.static_sigma is not None for each in self.detectors.values())
 
     def __getitem__(self, key: str) -> Detector:
         """The `Detector` of an id."""

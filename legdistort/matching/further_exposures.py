@@ -92,7 +92,9 @@ def _check_new(before, after):
     """Raise `InputError` for an exposure that is there already, by its name or by its positions to the last bit."""
     for name in after.names:
         if name in before.names:
-            raise InputError(f"exposure {name} is in the solution already: leave it out; another one needs another name")
+            raise InputError(
+                f"exposure {name} is in the solution already: leave it out; another one needs another name"
+            )
     exposure = np.concatenate([before.exposure, len(before.names) + after.exposure])
     for copy, original in copies(exposure, np.concatenate([before.xy, after.xy])).items():
         if original < len(before.names) <= copy:
@@ -104,11 +106,14 @@ def _check_new(before, after):
 
 
 def _on_its_plane(solution, matches, mean):
-    """How the solution calls the stars of matches (n_stars,), whether these join (n_stars,), and poses from its plane."""
+    """How the solution calls stars of matches (n_stars,), whether they join (n_stars,), and poses from its plane."""
     seen, own = Observations.of(solution.residuals), matches.observations
     of_field = np.zeros(len(seen.stars), dtype=int)
     of_field[seen.star] = seen.fields[seen.exposure]
-    known, given = (seen.stars, solution.estimate.positions, seen.flux), (own.stars, _places(solution, matches), own.flux)
+    known, given = (
+        (seen.stars, solution.estimate.positions, seen.flux),
+        (own.stars, _places(solution, matches), own.flux),
+    )
     found, poses = np.full(len(own.stars), -1), dict(matches.poses)
     located = np.zeros(len(own.stars), dtype=bool)
     joins = np.bincount(own.star) >= _CONFIRMED

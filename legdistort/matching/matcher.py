@@ -217,7 +217,11 @@ def _label(table, names, shapes, headers, options, camera=None):
     lists = [_star_list(table[rows[name]], shapes[name]) for name in kept]
     star = np.full(len(table), -1)
     if len(names) == 1 and kept:
-        log.info("one exposure (%s): every detection is a star; a solution that it comes into (base=, --base), or a reference catalogue, solves it", names[0])
+        log.info(
+            "one exposure (%s): every detection is a star; a solution that it comes into (--base), or a reference "
+            "catalogue, solves it",
+            names[0],
+        )
         star[:] = np.arange(len(table))
         return star, left_out
     found = identify_holes(lists, kept, headers, left_out, gaps=len(camera.detectors) > 1 if camera else False)

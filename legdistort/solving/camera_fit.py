@@ -22,6 +22,7 @@ from ..results.new_positions import widened_all
 from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA
 from .equations.common_parts import followed, response
+from .gauge import hierarchy
 
 #: Part of what the data would determine of a direction alone below which it is not determined beside all else: what
 #: detectors and exposures can exchange is so to first order, and by the gradient of one times the other beyond.
@@ -39,6 +40,8 @@ _LIES_IN = 0.3
 #: Unknowns of less than this part of the largest of the directions are not judged in units of their own: what
 #: directions have of them is of second order, or rounding.
 _ROUNDED = 1e-3
+#: Size of modes of a map [pix] of which what is not rounding moves stars by more than a pixel.
+_CLEAR = 10.0
 #: Layouts that agree so well [pix] are the same.
 _SAME = 1e-6
 #: Steps at most, and their length in standard errors at which they end.
@@ -244,7 +247,8 @@ class CameraFit:
         camera = replace(camera, common_sigma=common_widths(camera, self.sought))
         matches = replace(fit.matches, camera=camera)
         errors = replace(_errors(fit, step, unknown), departure=self._from_stated(camera))
-        return replace(fit, matches=matches, camera_errors=errors, shared_unknowns=step.freedom)
+        fit = replace(fit, matches=matches, camera_errors=errors, shared_unknowns=step.freedom)
+        return _with_common_map(fit, step) if fit.problem.floats else fit
 
     def _from_stated(self, camera):
         """The `Departure` of what was found from what was stated, None if nothing was.
@@ -304,6 +308,26 @@ def _errors(fit, step, unknown):
         moved -= plain @ (np.linalg.pinv(plain) @ moved)
         unknown_stars[good] = (moved / np.sqrt(np.mean(moved**2, axis=(0, 1)))).transpose(1, 0, 2)
     return CameraErrors(step.free, changes, stars, coefficients, unknown_stars)
+
+
+def _with_common_map(fit, step):
+    """The fit whose gauge has the error of the map that all detectors share, where widths keep exposures from it.
+
+    Elsewhere it is in the departures of exposures, which can be exchanged for it.
+    """
+    good, gauge = fit.blocks.v[0] > 0, fit.result.gauge
+    positions = fit.result.state.positions.T
+    inverse = np.linalg.pinv(gauge.modes_at(positions[good], gauge.n_modes).T)
+
+    def of_plane(changes):
+        return (inverse @ (step.spread[:, good] @ changes)).reshape(2 * gauge.n_modes, -1)
+
+    common, weak = of_plane(unit_errors(step.covariance)), of_plane(step.weak.T)
+    weak = _CLEAR * weak / np.maximum(np.sqrt(np.mean(weak**2, axis=0)), np.finfo(float).tiny)
+    before = [_CLEAR * each.map for each in gauge.unknown_maps]
+    unknown = hierarchy.named(np.column_stack([*before, weak]), gauge, positions)
+    gauge = replace(gauge, covariance=gauge.covariance + common @ common.T, unknown_maps=unknown)
+    return replace(fit, result=replace(fit.result, gauge=gauge))
 
 
 def _groups(fit):

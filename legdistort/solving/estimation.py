@@ -350,6 +350,9 @@ def _of_camera(matches, prior, model, degree, layout, static, exposure_degree):
         )
     if prior is not None or model is not None:
         return sought, prior
+    # nothing known of it is not the same as none; of detectors that no star ties their layout is all that holds them
+    if static is None and not camera.states_static and len(camera.groups(matches.table)) == 1:
+        return sought, None
     known, widths = {"source": f"camera {camera.name}"}, common_widths(camera, sought)
     if widths is None:
         return None, Prior(np.zeros((2, 1)), **known)

@@ -92,7 +92,7 @@ class ReferenceTie:
     def tie(self, problem, result):
         """The `Result` with the plane where the reference puts it and the `Tie` in its gauge, and the `MapPrior` there.
 
-        Third what has no map of its own any more of this `ReferenceTie`.
+        First the problem that it solves, last what has no map of its own any more of this `ReferenceTie`.
 
         Parameters
         ----------
@@ -134,6 +134,7 @@ class ReferenceTie:
                 state = _drifted(problem, replace(result, state=state), step)[1]
                 result = self._kept(self.solve(problem, state, hold=True), gauge)
             else:
+                problem = _centred(problem, result, step)
                 result = self.solve(problem, state, common=common)
         else:
             log.warning(
@@ -157,7 +158,7 @@ class ReferenceTie:
         log.info("%s", made.sentence)
         if result.converged:
             result = replace(result, status=f"{status}, tied to the reference in {count + 1} rounds{rest}")
-        return replace(result, gauge=replace(result.gauge, tie=made, unknown_maps=unknown)), prior, straight
+        return problem, replace(result, gauge=replace(result.gauge, tie=made, unknown_maps=unknown)), prior, straight
 
     def _agreement(self, problem, result, equations, made):
         """The `Agreement` of the reference with everything else."""
@@ -398,6 +399,25 @@ def _common(problem, result, step):
     return gauge.common_map(departure) + step
 
 
+def _solved(before, problem, state, **how):
+    """The `Result` of a minimisation; what a camera told of common maps `before`, a gauge, is kept."""
+    result = minimisers.solve_joint(problem, state, **how)
+    if not problem.floats:
+        return result
+    known = {"covariance": before.covariance, "unknown_maps": before.unknown_maps}
+    return replace(result, gauge=replace(result.gauge, **known))
+
+
+def _centred(problem, result, step):
+    """The problem with widths about a mean that is not known moved along with a map."""
+    gauge = result.gauge
+    if not problem.floats:
+        return problem
+    centre = np.zeros_like(problem.prior_mean) if problem.centre is None else problem.centre.copy()
+    centre[:, :, : gauge.n_modes] -= (gauge.motion @ step).reshape(len(centre), 2, -1)
+    return replace(problem, centre=centre)
+
+
 def _drifted(problem, result, step):
     """The `Problem` and the `State` moved by maps (2 n_modes + q,), those that change with time too, to first order."""
     gauge, state = result.gauge, result.state
@@ -460,16 +480,17 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
         reference.label,
         matches.stars,
         scale=scale,
-        solve=partial(minimisers.solve_joint, loss=of.loss, max_iterations=of.max_iterations),
+        solve=partial(_solved, result.gauge, loss=of.loss, max_iterations=of.max_iterations),
         common={"shared_errors": fit.shared_errors, "camera": fit.camera_errors},
         finds_errors=reference.finds_errors,
         degree=reference.degree or 0,
     )
     problem = fit.problem.scaled(fit.used.astype(float))
-    result, prior, tying = tying.tie(problem, result)
+    problem, result, prior, tying = tying.tie(problem, result)
     if result.gauge.n_modes >= FEWEST_MODES or problem.terms.n:
         problem, result = tying.hold_stars(problem, result, prior)
-        fit = replace(fit, problem=replace(fit.problem, moving=problem.moving), **_held_back(fit, problem))
+        known = {"moving": problem.moving, "centre": problem.centre}
+        fit = replace(fit, problem=replace(fit.problem, **known), **_held_back(fit, problem))
     else:  # the map moves the plane alone
         result = replace(result, gauge=replace(result.gauge, tie=replace(result.gauge.tie, freedom=0.0)))
     return replace(fit, matches=replace(matches, sky=identified.sky, epoch=epoch), result=result)

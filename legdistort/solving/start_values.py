@@ -18,7 +18,7 @@ _ENOUGH = 300
 
 
 def start(problem, nominal, *, robust=False):
-    """Start values: coefficients where they begin, by default at the prior mean, poses refined to one another, positions their weighted mean.
+    """Start values: coefficients where the problem begins, poses refined to one another, positions their weighted mean.
 
     Parameters
     ----------

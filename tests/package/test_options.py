@@ -106,6 +106,17 @@ def catalogue(setting):
     return made
 
 
+def earlier(setting):
+    """A solution of the same stars in other exposures."""
+    seen = matches(setting)
+    table, camera = seen.camera.on_detectors(seen.table.copy()), seen.camera if seen.camera.is_known else None
+    table["x"] += np.random.default_rng(3).normal(0, SIGMA, len(table)) * u.pix
+    table["exposure"] = [f"before_{name}" for name in table["exposure"]]
+    known = {f"before_{name}": pose for name, pose in seen.poses.items()}
+    shape = None if seen.camera.has_focal_plane else SHAPE
+    return quiet(solve, Matches.from_table(table, shape=shape, camera=camera, poses=known, sky=seen.sky), degree=1)
+
+
 def form(degree):
     """A model for the whole of what has this degree."""
 
@@ -193,6 +204,7 @@ SEVERAL = single("is for exposures with several detectors")
 OWN = {"one": "camera one has a static distortion of its own: leave prior and model out"}
 
 SOLVE = [
+    row(base=earlier),
     row(degree=0),
     row(degree=2),
     row(degree="auto"),

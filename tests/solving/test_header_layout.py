@@ -13,6 +13,7 @@ from astropy.table import Table
 import legdistort
 from legdistort.cameras import ties
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortWarning
+from legdistort.geometry.similarity import apply, fit_similarity
 from legdistort.solving.camera_fit import in_camera
 
 STATES = ("camera", "absolute")
@@ -55,14 +56,18 @@ def test_it_is_found_by_default(far, solution):
 
 
 def test_it_does_not_matter_how_wrong_it_was(near, far, solution):
-    """The same night by headers that are ten times nearer: the same stars after the map that nothing determines."""
+    """The same night by headers that are ten times nearer: the same stars after the map that nothing determines.
+
+    That has the degree of the distortions: nothing is known of them.
+    """
     night, matches = near
     again = legdistort.solve(matches, layout="fit")
     a = dict(zip(far.true_stars(solution), solution.estimate.positions, strict=True))
     b = dict(zip(night.true_stars(again), again.estimate.positions, strict=True))
     assert a.keys() == b.keys()
     a, b = (np.array([each[star] for star in sorted(a)]) for each in (a, b))
-    design = np.column_stack([a, np.ones(len(a))])
+    x, y = (a / np.ptp(a, axis=0)).T
+    design = np.column_stack([x**i * y**j for i in range(4) for j in range(4 - i)])
     assert np.abs(b - design @ np.linalg.lstsq(design, b, rcond=None)[0]).max() < 2e-3
     assert np.allclose(again.stars["x_err"].value.mean(), solution.stars["x_err"].value.mean(), rtol=0.01)
     for key in header_layouts.KEYS:  # what the headers have right of scale and rotation is not given up for shifts
@@ -119,7 +124,7 @@ def test_detectors_together_keep_the_scale_of_headers(bent):
 def test_the_check_of_absolute_positions_names_what_cures_it(near, name):
     """Where headers may tell what stars do not; and with it the check passes."""
     before, after = (
-        next(check for check in legdistort.solve(near[1], **known).checks if check.name == "absolute")
+        next(check for check in legdistort.solve(near[1], static="hold", **known).checks if check.name == "absolute")
         for known in ({}, {name: {"shift": 4.0, "rotation": 0.01}})
     )
     assert before.state == "unknown"
@@ -303,6 +308,42 @@ def known_stars(night):
     places = zip(header_layouts.KEYS, night.stated, strict=True)
     detectors = {key: legdistort.Detector(shape, layout=place, layout_sigma=np.inf) for key, place in places}
     return legdistort.Matches.from_table(table, camera=legdistort.Camera("four", detectors))
+
+
+@pytest.mark.parametrize("n_sets", [2, pytest.param(20, marks=pytest.mark.slow)])
+def test_nothing_stated_of_statics_is_not_none(n_sets):
+    """Absolute errors are true where the focal plane has a distortion that nobody stated; dithers and rolls tell it."""
+    squares = np.zeros(2)
+    for seed in range(n_sets):
+        night = header_layouts.Night(seed, off=0.5, n=9, rolls=(0.0, 0.0, 30.0, 90.0), size=0.1, static=3.0)
+        solution = legdistort.solve(known_stars(night))
+        true = night.sky[solution.estimate.star_names]
+        off = apply(fit_similarity(solution.estimate.positions, true), solution.estimate.positions) - true
+        stated = np.column_stack([solution.stars[name].value for name in ("x_err_abs", "y_err_abs")])
+        squares += np.sum(off**2), np.sum(stated**2)
+    assert squares[0] / squares[1] == pytest.approx(1, abs=0.3 if n_sets > 10 else 0.6)
+
+
+@pytest.mark.parametrize("n_sets", [2, pytest.param(20, marks=pytest.mark.slow)])
+def test_a_reference_tells_what_exposures_without_widths_cannot(n_sets):
+    """Shear and z^2 of the focal plane, where statics are fitted and exposures have nothing of their own."""
+    squares, evidence = np.zeros(2), legdistort.Prior(None, sigma="evidence")
+    for seed in range(n_sets):
+        night = header_layouts.Night(seed, off=0.5, n=6, rolls=(0.0, 0.02), size=0.0, static=0.6, n_stars=250)
+        matches, rng = known_stars(night), np.random.default_rng(seed)
+        names = rng.permutation(matches.stars)[:60]
+        catalogue = Table({"star": names})
+        catalogue["x"], catalogue["y"] = (night.sky[names] + rng.normal(0, 0.02, (60, 2))).T
+        catalogue["x_err"] = catalogue["y_err"] = 0.02
+        solution = legdistort.solve(matches, static="fit", prior=evidence, reference=catalogue)
+        off = solution.estimate.positions - night.sky[solution.estimate.star_names]
+        stated = np.column_stack([solution.stars[name].value for name in ("x_err_abs", "y_err_abs")])
+        squares += np.sum(off**2), np.sum(stated**2)
+        assert states(solution)["absolute"] == "pass"
+    assert squares[0] / squares[1] == pytest.approx(1, abs=0.4 if n_sets > 10 else 0.8)
+    without = legdistort.solve(matches, static="fit", prior=evidence)
+    assert {"shear", "z^2", "i z^2"} <= set(without.gauge.unknown_names)
+    assert states(without)["absolute"] == "unknown"
 
 
 def pull_across(n_sets, **options):

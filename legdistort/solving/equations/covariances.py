@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...exceptions import AssumptionWarning, warn
+from ...exceptions import AssumptionWarning, SolveError, warn
 from ...results.errors.coefficient_covariance import times
 from ...results.errors.common_maps import CommonFit, modes_for, of_normal, plain_maps
 from ...results.gauge import UnknownDirection
@@ -187,7 +189,17 @@ class Uncertainty:
     @cached_property
     def directions(self) -> np.ndarray:
         """See `legdistort.results.gauge.Gauge.directions`."""
-        return self._directions(self.system)
+        return self._directions(self._moving)
+
+    @property
+    def _moving(self):
+        """The reduced system in which maps move the plane; widths about a mean that is not known move along."""
+        if not self._problem.floats:
+            return self.system
+        problem, blocks = replace(self._problem, prior_sigma=None), replace(self._blocks, u=self._blocks.u_data)
+        with contextlib.suppress(SolveError):  # exposures of few stars have widths alone
+            return reduced_system.reduced_system(problem, blocks, self._gauge)
+        return self.system
 
     def _directions(self, system):
         gauge = self._gauge

@@ -77,6 +77,8 @@ class Problem:
         How stars move from exposure to exposure; None: they do not.
     begun : ndarray, shape (n_exposures, 2, n_all), or None
         Coefficients with which a minimisation begins; None: those of the prior mean.
+    floats : bool
+        Widths are about a mean of which nothing is known: what all exposures have in common is to cost nothing.
     weak : float
         Eigenvalue of the normalised equations below which a distortion that exposures share is held.
     """
@@ -104,6 +106,7 @@ class Problem:
     field: np.ndarray | int = 0
     moving: StarTerms | None = None
     begun: np.ndarray | None = None
+    floats: bool = False
     weak: float = 1e-3
 
     @cached_property
@@ -392,6 +395,7 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
                 f"lower the degree (at most {_highest_degree(count)} here), give a prior with sigma, "
                 "or leave the exposure out"
             )
+    has_widths, mean_sigma = not free.all(), _mean_sigma(priors, degree)
     problem = Problem(
         degree=degree,
         names=matches.names,
@@ -403,9 +407,10 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
         xy=np.array(obs.xy.T[:, order], order="C"),
         weight=weight,
         prior_mean=mean,
-        prior_sigma=None if free.all() else sigma,
+        prior_sigma=sigma if has_widths else None,
         static_sigma=_static_sigma(priors, degree),
-        mean_sigma=_mean_sigma(priors, degree),
+        mean_sigma=mean_sigma,
+        floats=has_widths and bool(np.isinf(mean_sigma[np.isfinite(sigma)]).all()),
         own_degree=own_degree,
         group=_groups(matches),
         night=matches.blocks,

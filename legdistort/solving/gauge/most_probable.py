@@ -91,7 +91,7 @@ class MostProbable:
         if problem.prior_sigma is not None:
             given = np.array([problem.has_widths(i) for i in range(problem.n_exposures)])
             widths = np.where(given[:, None, None], problem.prior_sigma, widths)
-        return replace(problem, prior_mean=mean, prior_sigma=widths, centre=centre)
+        return replace(problem, prior_mean=mean, prior_sigma=widths, centre=centre, floats=False)
 
     def covariances(self):
         """Of the unknowns of all exposures, (n, n); and as if nothing told the size of a static distortion.
@@ -147,7 +147,9 @@ def counts(problem, state, shown=1.0):
     squares = np.sum(departures**2, axis=1)
     if np.mean(squares) <= limit:
         return False
-    whole = replace(problem, prior_mean=_padded(problem.prior_mean, state))  # what they have in common beyond the degree
+    whole = replace(
+        problem, prior_mean=_padded(problem.prior_mean, state)
+    )  # what they have in common beyond the degree
     own = known.others @ conditional_errors(criterion.linearise(whole, state).u_data) @ known.others.mT
     noise, chance = np.einsum("ikk->i", own), np.sqrt(2 * np.einsum("ikl,ikl->i", own, own))
     seen = squares > noise + _SEEN * chance  # an exposure that is worth little departs far for nothing
