@@ -132,13 +132,7 @@ MAPS = {
     ),
     "second": Option("another, or the solution of a night", "second", metavar="NIGHT", path="read"),
 }
-BASE = {
-    "base": Option(
-        "a finished solution, file or folder, that these exposures come into; its options hold but for those given",
-        metavar="RESULTS",
-        path="read",
-    )
-}
+BASE = {"base": Option("a finished solution that these come into; its options hold", metavar="RESULTS", path="read")}
 COMPARED = {"degree": Option("of the series for a map that is none yet (default 5)", type=int)}
 NIGHTS = {
     "results": Option(

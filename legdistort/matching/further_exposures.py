@@ -1,7 +1,6 @@
 """Further exposures of the field, or of the camera, of a finished solution: the matches of all of them."""
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -63,7 +62,8 @@ def with_further(solution, matches):
     after["star"] = np.array(names.tolist())
     table = stacked({"the solution": before, "the exposures that come in": after})
     camera = matches.camera
-    whole = Matches.from_table(
+    begun = dict(zip(solution.names, solution.coefficients, strict=True))
+    return Matches.from_table(
         table,
         shape=None if camera.has_focal_plane else solution.estimate.shapes | matches.shapes,
         camera=camera if camera.is_known else None,
@@ -74,9 +74,8 @@ def with_further(solution, matches):
         header_distortion=matches.header_distortion,
         pointing=solution.diagnostics.pointing,
         allow_copies=True,
+        start=begun | mean,
     )
-    begun = dict(zip(solution.names, solution.coefficients, strict=True))
-    return replace(whole, start=begun | {name: mean[name] for name in matches.names})
 
 
 def _check_camera(known, given):

@@ -157,8 +157,8 @@ class Observations:
         return cls(table, names, stars, exposure, star, xy.T, covariance.T)
 
 
-def _read_poses(meta):
-    return {name: np.array(pose) for name, pose in meta.items()}
+def _read_arrays(meta):
+    return {name: np.array(each) for name, each in meta.items()}
 
 
 def _read_sky(meta):
@@ -201,7 +201,7 @@ class Matches(ShownAsPrinted):
         How well headers tell where the plane lies on the sky, where they put it there.
     start : dict or None
         ``{exposure: (2, n_modes)}``: distortions with which a solution begins, pixels, normalised Legendre modes, in
-        the place of those of a prior; files do not keep them.
+        the place of those of a prior.
 
     See Also
     --------
@@ -220,7 +220,7 @@ class Matches(ShownAsPrinted):
 
     table: QTable
     shapes: dict[str, tuple[int, int]] = field(metadata={BY_EXPOSURE: True})
-    poses: dict[str, np.ndarray] = field(metadata={BY_EXPOSURE: True, READ: _read_poses})
+    poses: dict[str, np.ndarray] = field(metadata={BY_EXPOSURE: True, READ: _read_arrays})
     sky: TangentPlane | None = field(default=None, metadata={READ: _read_sky})
     left_out: dict[str, str] = field(default_factory=dict)
     epoch: float | None = None
@@ -229,7 +229,7 @@ class Matches(ShownAsPrinted):
     camera: Camera = field(default=None, metadata={READ: Camera.from_meta})
     pose_sigma: dict[str, float] | None = None
     pointing: HeaderPointing | None = field(default=None, metadata={READ: HeaderPointing.of_meta})
-    start: dict[str, np.ndarray] | None = field(default=None, metadata={BY_EXPOSURE: True})
+    start: dict[str, np.ndarray] | None = field(default=None, metadata={BY_EXPOSURE: True, READ: _read_arrays})
 
     def __post_init__(self) -> None:
         if self.camera is None:
@@ -436,7 +436,7 @@ class Matches(ShownAsPrinted):
         allow_copies: bool = False,
         camera: Camera | None = None,
         pose_sigma: Mapping[str, float | u.Quantity] | None = None,
-        **passed_on: HeaderPointing | None,
+        **passed_on: HeaderPointing | Mapping[str, np.ndarray] | None,
     ) -> Matches:
         """Matches from a table of positions whose stars are identified.
 
@@ -468,7 +468,7 @@ class Matches(ShownAsPrinted):
             plane of the camera, whose layout and static distortion count as known. What an exposure adds is then a
             distortion of the focal plane as a whole.
         **passed_on
-            ``pointing``, as `read_meta` has it.
+            ``pointing`` and ``start``, as `read_meta` has them.
         pose_sigma : dict, optional
             Standard errors of the poses given, which are then more than start values: of ``shift``, that of the middle
             of the detector [pix, both axes], ``rotation`` [deg] about it, and ``scale`` (relative); 0 is exact, and
@@ -527,7 +527,7 @@ class Matches(ShownAsPrinted):
 
 def _beside_the_table():
     """Fields of `Matches` that a file has in the header of its table."""
-    return [each for each in fields(Matches) if each.name not in ("table", "observations", "start")]
+    return [each for each in fields(Matches) if each.name not in ("table", "observations")]
 
 
 def _plain(value):

@@ -402,19 +402,16 @@ def _common(problem, result, step):
 def _solved(before, problem, state, **how):
     """The `Result` of a minimisation; what a camera told of common maps `before`, a gauge, is kept."""
     result = minimisers.solve_joint(problem, state, **how)
-    if not problem.floats:
-        return result
-    known = {"covariance": before.covariance, "unknown_maps": before.unknown_maps}
+    known = {name: getattr(before, name) for name in ("covariance", "unknown_maps") if problem.floats}
     return replace(result, gauge=replace(result.gauge, **known))
 
 
 def _centred(problem, result, step):
     """The problem with widths about a mean that is not known moved along with a map."""
-    gauge = result.gauge
     if not problem.floats:
         return problem
     centre = np.zeros_like(problem.prior_mean) if problem.centre is None else problem.centre.copy()
-    centre[:, :, : gauge.n_modes] -= (gauge.motion @ step).reshape(len(centre), 2, -1)
+    centre[:, :, : result.gauge.n_modes] -= (result.gauge.motion @ step).reshape(len(centre), 2, -1)
     return replace(problem, centre=centre)
 
 

@@ -45,6 +45,7 @@ def by_detector(matches, static):
         poses={detector_name(*part): similarity.compose(own[part[1]][0], matches.poses[part[0]]) for part in parts},
         left_out={detector_name(name, key): why for name, why in matches.left_out.items() for key in own},
         camera=None,
+        start=None,
     )
     made.observations.check()
     return made, {key: prior for key, (_, prior) in own.items()}

@@ -276,5 +276,16 @@ def test_meta_survives_ecsv(tmp_path, sky):
 
 
 def test_meta_of_a_foreign_table_is_nothing():
-    known = "shape", "poses", "sky", "left_out", "epoch", "header_distortion", "camera", "pose_sigma", "pointing"
+    known = (
+        "shape",
+        "poses",
+        "sky",
+        "left_out",
+        "epoch",
+        "header_distortion",
+        "camera",
+        "pose_sigma",
+        "pointing",
+        "start",
+    )
     assert Matches.read_meta({"author": "somebody"}) == dict.fromkeys(known)

@@ -73,8 +73,9 @@ def matches():
     table["x"], table["y"] = xy.T * u.pix
     table["epoch"] = (2015.0 + np.array([int(name[-2:]) for name in table["exposure"]])) * u.yr
     sky = TangentPlane(10.0, -70.0, np.array([[-1e-5, 1e-6, 2e-3], [1e-6, 1e-5, -1e-3]]))
+    start = {name: RNG.normal(0, 1, (2, 6)) for name in sim.matches.names}
     return Matches.from_table(
-        table, camera=pair, poses=sim.matches.poses, sky=sky, left_out={"bad": "no stars: 'none'"}, epoch=2020.25,
+        table, camera=pair, start=start, poses=sim.matches.poses, sky=sky, left_out={"bad": "no stars: 'none'"}, epoch=2020.25,
         header_distortion="SIP, up to 4.48 px over the detector", pose_sigma={"shift": 20.0, "scale": 0.1},
         pointing=HeaderPointing(2, 0.5, 0.1, {"e0": (30.0, 180.0)}, (("e0", "e1"), ("e2",))),
     )  # fmt: skip
@@ -167,7 +168,7 @@ COPIES = {
     "replace": lambda given, path: replace(given),
 }
 FEWER = {"table": "has fewer rows", "observations": "are those of the table"}
-PARTS = dict.fromkeys(("shapes", "poses", "left_out"), "have the names of single detectors")
+PARTS = dict.fromkeys(("shapes", "poses", "left_out", "start"), "have the names of single detectors, or none")
 ANEW = {"table": "has other positions", "observations": "are those of the table"}
 PLACES = {"detectors": "lie where the exposures show them", "common_sigma": "counts what was fitted"}
 
@@ -202,7 +203,7 @@ CASES = {
         {
             "keep": FEWER,
             "keep a slice": FEWER,
-            "without": FEWER | dict.fromkeys(("shapes", "poses"), "are of the exposures left")
+            "without": FEWER | dict.fromkeys(("shapes", "poses", "start"), "are of the exposures left")
             | {"left_out": "has one more"},
             "validate": FEWER,
             "single detectors": ANEW | PARTS | {"camera": "is of no use to single detectors"},

@@ -286,7 +286,7 @@ def test_options_are_the_arguments_and_frozen():
     for field in dataclasses.fields(SolveOptions):
         assert arguments[field.name].default == field.default
     assert set(arguments) - {f.name for f in dataclasses.fields(SolveOptions)} == {
-        "matches", "reference", "reference_error", "reference_degree", "epoch", "progress",
+        "matches", "base", "reference", "reference_error", "reference_degree", "epoch", "progress",
     }  # fmt: skip
     with pytest.raises(dataclasses.FrozenInstanceError):
         SolveOptions().degree = 4
