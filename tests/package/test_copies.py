@@ -75,7 +75,8 @@ def matches():
     sky = TangentPlane(10.0, -70.0, np.array([[-1e-5, 1e-6, 2e-3], [1e-6, 1e-5, -1e-3]]))
     start = {name: RNG.normal(0, 1, (2, 6)) for name in sim.matches.names}
     return Matches.from_table(
-        table, camera=pair, start=start, poses=sim.matches.poses, sky=sky, left_out={"bad": "no stars: 'none'"}, epoch=2020.25,
+        table, camera=pair, start=start, poses=sim.matches.poses, sky=sky, left_out={"bad": "no stars: 'none'"},
+        epoch=2020.25,
         header_distortion="SIP, up to 4.48 px over the detector", pose_sigma={"shift": 20.0, "scale": 0.1},
         pointing=HeaderPointing(2, 0.5, 0.1, {"e0": (30.0, 180.0)}, (("e0", "e1"), ("e2",))),
     )  # fmt: skip

@@ -7,6 +7,7 @@ from pathlib import Path
 from ...exceptions import InputError
 from ...inputs.repetitions import fingerprints
 from ...matching.further_exposures import with_further
+from ...matching.matches import Matches
 from ...results.settings import Settings
 from ...results.solution import Solution
 from ...runtime.provenance import now
@@ -20,7 +21,7 @@ def with_base(solve):
 
     @wraps(solve)
     def extended(matches, *, base=None, **given):
-        if base is None:
+        if base is None or not isinstance(matches, Matches):  # which is refused there
             return solve(matches, **given)
         before = _opened(base)
         _check(before, given)
@@ -60,9 +61,9 @@ def _check(base, given):
     }
     for name in needed:
         if needed[name] and given.get(name) is None:
+            words = f"{name}=" + f", --{name}" * (name != "model")
             raise InputError(
-                f"the base was solved with a {name}, of which it keeps a description alone: give it again ({name}=, "
-                f"--{name})"
+                f"the base was solved with a {name}, of which it keeps a description alone: give it again ({words})"
             )
 
 
