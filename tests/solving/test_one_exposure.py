@@ -173,6 +173,8 @@ def test_no_cure_is_named_that_is_refused():
         ({"static": "fit"}, "static='fit' compares exposures"),
         ({"validate": 0.1}, "validate=0.1 compares exposures"),
         ({"motion": "proper"}, "motion='proper' compares exposures"),
+        ({"prior": ld.Prior(np.zeros((2, 10)), sigma="evidence", static_sigma=0.1)}, "only one.*--prior-sigma 0.05"),
+        ({"prior": ld.Prior(None, sigma="evidence")}, "sigma='evidence' of the prior"),
     ],
 )
 def test_options_that_compare_exposures_are_refused(options, words):
