@@ -202,7 +202,10 @@ def _turned(reference, positions, flux):
 
 
 def _registered(source, target, source_flux, target_flux, near, *, guess):
-    """Rows of source and target by `registration.register`; None if nothing stands out from chance."""
+    """Rows of source and target by `registration.register`; None if nothing stands out from chance.
+
+    The shorter list is laid on the longer one: of a part of the longer most stars may have none in the other.
+    """
     if min(len(source), len(target)) < 5:
         return None
     fluxes = (None, None) if source_flux is None or target_flux is None else (source_flux, target_flux[near])
@@ -210,9 +213,11 @@ def _registered(source, target, source_flux, target_flux, near, *, guess):
     for xy, flux, shift in ((source, fluxes[0], 0.0), (target, fluxes[1], 10.0)):  # so that nothing stands still
         low, span = xy.min(axis=0) - shift, np.ptp(xy, axis=0) + shift
         lists.append((low, StarList(xy - low, np.zeros(len(xy)), tuple(np.ceil(span[::-1]).astype(int) + 1), flux)))
-    (low, stars), (other, catalogue) = lists
-    found = register(stars, catalogue, guess=np.column_stack([np.eye(2), low - other]) if guess else None)
-    return None if found is None else (found.source, found.target)
+    (low, short), (other, long) = sorted(lists, key=lambda each: len(each[1]))
+    found = register(short, long, guess=np.column_stack([np.eye(2), low - other]) if guess else None)
+    if found is None:
+        return None
+    return (found.source, found.target) if short is lists[0][1] else (found.target, found.source)
 
 
 def _neighbours(positions, plane, span):
