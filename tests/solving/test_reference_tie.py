@@ -549,6 +549,23 @@ def test_units_masks_and_names_of_vizier(night, tied):
     assert_allclose(solution.estimate.positions, tied.estimate.positions, atol=1e-6)
 
 
+@pytest.mark.parametrize("called", ["{}_err", "e_{}", "{}_unc", "E_{}"])
+def test_errors_that_are_called_otherwise(night, called):
+    plain = gaia(night)
+    names = ("ra", "dec", "pmra", "pmdec")
+    other = plain.copy()
+    for name in names:
+        other.rename_column(f"{name}_error", called.format(name))
+    assert_allclose(read_reference(other).covariance, read_reference(plain).covariance)
+
+
+def test_a_file_is_said_to_have_the_columns_that_it_has(night, tmp_path):
+    table = gaia(night)["ra", "dec"]
+    table.write(tmp_path / "stars.fits")
+    with pytest.raises(InputError, match="it has ra, dec: rename the columns that are these"):
+        read_reference(tmp_path / "stars.fits")
+
+
 def test_stars_without_motion_serve_at_their_own_epoch_only(night):
     table = gaia(night)
     mask = np.zeros(len(table), bool)
@@ -657,6 +674,7 @@ def change(**columns):
         (lambda t: 3, "reference must be a table, the path of one, or a SkyCoord, got int"),
         (lambda t: change(ra=1.0, dec=95.0, ra_error=1.0, dec_error=1.0)(t), "dec must lie in -90 ... 90 degrees"),
         (lambda t: change(ra=1.0, dec=5.0)(t), "lacks ra_error and dec_error, errors of its positions"),
+        (lambda t: change(ra=1.0, dec=5.0, ra_sd=1.0)(t), "dec, ra_sd: rename the columns .* or state one for all"),
         (change(ra=1.0, dec=5.0, ra_error=1.0, dec_error=1.0, pmra=1.0), "one of pmra, pmdec is missing"),
         (
             change(ra=1.0, dec=5.0, ra_error=1.0, dec_error=1.0, pmra=1.0, pmdec=1.0),

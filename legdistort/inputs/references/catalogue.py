@@ -37,6 +37,11 @@ VIZIER = {
     "e_raj2000": "ra_error", "e_dej2000": "dec_error", "e_radeg": "ra_error", "e_dedeg": "dec_error",
     "_raj2000": "ra", "_dej2000": "dec", "_ra": "ra", "_de": "dec",
 }  # fmt: skip
+#: Errors as other tables call them.
+VIZIER |= {
+    given.format(name): f"{name}_error"
+    for name in ("ra", "dec", "pmra", "pmdec", "parallax") for given in ("{}_err", "e_{}", "{}_unc")
+}  # fmt: skip
 #: How the tables of the CDS call the parts of sexagesimal positions, in small letters.
 _PARTS = ("rah", "ram", "ras", "ded", "dem", "des", "de-")
 #: Columns of errors that are not called NAME_error.
@@ -236,6 +241,8 @@ def read_reference(reference, error=None, degree=None):
     check_stated(error, degree)
     if isinstance(reference, (str, Path)):
         label, table = f"the reference {reference}", read_table(reference)
+        if "exposure" in table.colnames and table["exposure"].info.description == column_contract.OF_FILE:
+            table.remove_column("exposure")  # of what is read as a list of positions
     elif isinstance(reference, Table):
         label, table = "the reference", Table(reference)  # Quantities become columns with a unit
     elif isinstance(reference, SkyCoord):
@@ -445,10 +452,12 @@ def _errors(table, values, unit, label):
     names = [_ERRORS.get(name, f"{name}_error") for name in values]
     missing = [name for name in names if name not in table.colnames]
     if missing:
-        of = "positions" if values[0] in ("x", "ra") else "motions"
+        of, else_ = "motions", "add them, or leave the motions out"
+        if values[0] in ("x", "ra"):
+            of, else_ = "positions", "state one for all (reference_error=, --reference-error)"
         raise InputError(
-            f"{label} lacks {' and '.join(missing)}, errors of its {of} "
-            f"({unit}, standard deviations); it has {', '.join(table.colnames)}"
+            f"{label} lacks {' and '.join(missing)}, errors of its {of} ({unit}, standard deviations); it has "
+            f"{', '.join(table.colnames)}: rename the columns that are these, or {else_}"
         )
     out = np.column_stack([column_contract.values(table, name, unit) for name in names])
     bad = ~(out > 0) & np.isfinite(out)
