@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..exceptions import InputError
-from ..geometry import similarity
+from ..geometry import similarity, star_hull
 from ..geometry.tangent_plane import TangentPlane, angles, directions
 from ..inputs.references.catalogue import Reference
 from .registration import register
@@ -48,6 +48,10 @@ class Identified:
         stars without one.
     maps, unknown : ndarray, shape (n, 2, m), or None
         What its positions have in common, see `legdistort.inputs.references.catalogue.Reference`; pixels.
+    names : ndarray of str, shape (n,), or None
+        What the reference calls them.
+    missing : tuple of str
+        What it calls others that lie among the stars of the solution, and are none of these.
     """
 
     rows: np.ndarray
@@ -57,6 +61,8 @@ class Identified:
     motion: np.ndarray | None = None
     maps: np.ndarray | None = None
     unknown: np.ndarray | None = None
+    names: np.ndarray | None = None
+    missing: tuple[str, ...] = ()
 
     def subset(self, these):
         """The same with some of its stars."""
@@ -98,12 +104,15 @@ def identify(reference, names, positions, *, flux=None, sky=None, pixel_scale=No
     rows = np.flatnonzero(solved)
     flux = None if flux is None else flux[rows]
     mine, theirs, sky = _pairs(reference, names[rows], positions[rows], flux, sky, pixel_scale)
-    rows, reference = rows[mine], reference.subset(theirs)
+    rows, others = rows[mine], reference.subset(np.setdiff1d(np.arange(len(reference)), theirs))
+    reference = reference.subset(theirs)
     if reference.xy is None and sky is None:
         sky = _tangent_plane(reference, positions[rows])
     found = reference.on_plane(sky)
     _check_agreement(reference.label, positions[rows], found.xy, np.ptp(positions[solved], axis=0).max())
-    return Identified(rows, found.xy, found.covariance, sky, found.motion, found.maps, found.unknown)
+    missing = _missing(others.on_plane(sky), found.xy, positions[rows], positions[solved])
+    common = found.motion, found.maps, found.unknown, found.names
+    return Identified(rows, found.xy, found.covariance, sky, *common, missing)
 
 
 def _pairs(reference, names, positions, flux, sky, pixel_scale):
@@ -269,6 +278,14 @@ def _tangent_plane(reference, positions):
         )
     plane = _middle(reference.sky, 1.0)
     return TangentPlane(plane.lon, plane.lat, similarity.robust_similarity(positions, reference.on_plane(plane).xy))
+
+
+def _missing(others, xy, places, positions):
+    """Names of other stars of a reference that lie among positions (n, 2), by those found at `xy` and their places."""
+    if others.names is None or len(places) < 3:
+        return ()
+    there = similarity.apply(similarity.robust_similarity(xy, places), others.xy)
+    return tuple(others.names[star_hull.supported(star_hull.around(positions), there.T)].tolist())
 
 
 def _check_agreement(label, positions, xy, size, share=0.5):

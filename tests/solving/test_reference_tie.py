@@ -398,6 +398,32 @@ def test_positions_are_matched_in_the_plane(sim, shift):
     assert_allclose(found.estimate.positions, named.estimate.positions, atol=1e-6)
 
 
+@pytest.mark.parametrize("called", ["source", None])
+def test_stars_of_a_reference_that_are_elsewhere_are_named_by_it(sim, caplog, tmp_path, called):
+    """Those far off are not found, those near are found and rejected; what lies outside the field is not counted."""
+    reference = planar(sim, 40, 0.02, named=False)
+    middle = np.argsort(np.hypot(*(np.column_stack([reference["x"], reference["y"]]) - 1024).T))
+    near, far = middle[[0, 1]], middle[[2, 3, 4]]
+    reference["x"][near] += 1.0
+    reference["y"][far] += 60.0
+    reference.add_row([5000.0, 1000.0, 0.02, 0.02])
+    names = np.array([f"row {row}" for row in range(41)])
+    if called:
+        names = np.array([f"S{7 * row}" for row in range(41)])
+        reference[called] = names
+    with caplog.at_level(logging.INFO, logger="legdistort"):
+        solution = solve(sim.matches, prior=Prior(sim.truth.static), reference=reference)
+    told = next(line for line in caplog.messages if "are in the exposures" in line)
+    assert told.startswith("37 of the 41 stars of the reference are in the exposures; 3 more lie among them and are")
+    assert sorted(told.split(": ")[1].split(", ")) == sorted(names[far])
+    tie = Solution.read(solution.write(tmp_path / "solution.asdf")).gauge.tie
+    assert sorted(tie.labels[~tie.used]) == sorted(names[near])
+    assert all(f"({name})" in tie.sentence for name in names[near])
+    assert tie.rejected == [
+        f"{star} ({name})" for star, name in zip(tie.stars[~tie.used], tie.labels[~tie.used], strict=True)
+    ]
+
+
 @pytest.mark.parametrize("n", [1, 4])
 def test_few_stars_are_matched_to_their_neighbours(sim, n):
     reference = planar(sim, n, 0.02)
@@ -592,7 +618,9 @@ def test_stars_left_out_for_the_want_of_a_motion_are_counted(night, caplog, epoc
         solve(night.matches, prior=Prior(night.truth.static), reference=table, epoch=epoch)
     told = next(line for line in caplog.messages if "of the reference are in the exposures" in line)
     words = f"; {n} are left out: they have no proper motion with errors to take them to {epoch:.2f}"
-    assert re.fullmatch(rf"\d+ of the {len(table)} stars of the reference are in the exposures{words * (n > 0)}", told)
+    missing = r"(; \d+ more lie among them and are not found: [\d, ]+( and \d+ more)?)?"
+    counted = rf"\d+ of the {len(table)} stars of the reference are in the exposures"
+    assert re.fullmatch(rf"{counted}{missing}{words * (n > 0)}", told)
 
 
 @pytest.mark.usefixtures("undrawn")

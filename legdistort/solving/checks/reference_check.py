@@ -89,7 +89,7 @@ def _scatter(name, tie, ratio, solution):
 def _mismatches(name, tie, ratio, solution):
     """Are many of its stars elsewhere?"""
     n, out = len(tie.used), np.count_nonzero(~tie.used)
-    lost = some_of([str(star) for star in tie.stars[~tie.used]], MOST_NAMED)
+    lost = some_of(tie.rejected, MOST_NAMED)
     if not out or special.bdtrc(out - 1, n, GROSS_ERRORS) > FALSE_ALARM:
         return None
     return Check("reference", "warn", out / n, GROSS_ERRORS,
