@@ -19,7 +19,6 @@ from astropy.wcs import WCS
 from ..exceptions import ExportError, InputError, some_of, without_astropy_warnings
 from ..inputs import detector_files, exposure_files, exposure_names, file_images
 from ..inputs.frames import header_texts, wcs_cards
-from ..inputs.frames.statement import read_statement
 from ..inputs.frames.weight_maps import WeightMaps
 from ..inputs.sky_wcs import leads_elsewhere, warn_of_another_field
 from ..inputs.wcs_files import PLACES
@@ -38,8 +37,8 @@ from .storage import wcs_tree
 log = logging.getLogger(__name__)
 
 _ASDF = b"#ASDF"
-#: Names that a message lists; letters of a comment that fit beside a number in a card.
-_MOST_NAMED, _COMMENT = 6, 47
+#: Names that a message lists.
+_MOST_NAMED = 6
 #: What the header of an image records of a WCS that was written into it; `attach` takes it for its own later.
 _HISTORY = "legdistort {} wrote the WCS of this image"
 #: Cards of the primary WCS and its distortion, all of which give way; those of alternative WCSs end in a letter.
@@ -322,7 +321,7 @@ def _plan(known, path, target, *, kind, max_error, ext, overwrite):
                 planes = file_images.planes_beside(hdulist, hdulist[image])
                 for number in (image, *(_number(hdulist, plane) for plane in planes)):
                     if kind == "head":
-                        own = _detector_cards(hdulist, number) if number == image else fits.Header()
+                        own = header_texts.detector_cards(hdulist, number) if number == image else fits.Header()
                         of_images[number] = headers[name] + own
                         continue
                     start, data, stop, _ = spans[number]
@@ -382,17 +381,6 @@ def _head(hdulist, of_images):
     """A file ``.head``, a text: the cards of every image, ``{number: Header}``, none for one without a solution."""
     images = (k for k, hdu in enumerate(hdulist) if file_images.is_image(hdu))
     return header_texts.text_of(of_images.get(k, fits.Header()) for k in images).encode("ascii")
-
-
-def _detector_cards(hdulist, number):
-    """Gain and saturation of an image under the keywords that SWarp reads, where its header has others for these."""
-    data, cards = hdulist[number].data, fits.Header()
-    header = wcs_cards.header_of_image(hdulist[0].header, hdulist[number].header)
-    stated = read_statement(header, data, integer=False)
-    for keyword, each in (("GAIN", stated.gain), ("SATURATE", stated.saturation)):
-        if each.value is not None and header.get(keyword) != each.value:
-            cards[keyword] = each.value, f"by {each.source}"[:_COMMENT]
-    return cards
 
 
 def _header(known, name, kind, max_error):
