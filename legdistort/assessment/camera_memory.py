@@ -137,13 +137,16 @@ class CombinedNights(ShownAsPrinted):
         return (self._rows.T @ mean).reshape(2, -1), self._rows.T @ covariance @ self._rows
 
     @plain_numbers
-    def prior(self, date: float | Time | None = None) -> Prior:
+    def prior(self, date: float | Time | None = None, *, one_exposure: bool = False) -> Prior:
         """What is known of the static distortion of a further night: S at its date, with its error and nights' scatter.
 
         Parameters
         ----------
         date : float or `~astropy.time.Time`, optional
             As for `static`.
+        one_exposure : bool
+            Whether it is for one exposure alone, which does not tell how far exposures scatter: as far as those of
+            the nights, `exposure_scatter`, is the `sigma` of the prior then.
         """
         mean, covariance = self._chain.at(self._year(date))
         sigma = np.sqrt(np.diag(covariance) + self._widths**2)
@@ -152,7 +155,11 @@ class CombinedNights(ShownAsPrinted):
         # every coefficient of a shear has the width of the shear: that is what a prior of widths states of it
         widths = np.max(np.where(self._rows != 0, np.where(known, sigma, np.inf)[:, None], 0), axis=0).reshape(2, -1)
         record = {"kind": "nights", "name": self.name, "nights": len(self.nights)}
-        return Prior(static, static_sigma=widths, shape=self.shape, source=record)
+        known = Prior(static, static_sigma=widths, shape=self.shape, source=record)
+        if not (one_exposure and np.any(self.exposure_scatter)):
+            return known
+        degrees = np.maximum(np.add(*basis.orders(self.degree)), 1)  # a shift is a part of the pose
+        return known.with_sigma(self.exposure_scatter[degrees - 1])
 
     @plain_numbers
     def camera(self, date: float | Time | None = None) -> Camera:
@@ -228,6 +235,16 @@ class CombinedNights(ShownAsPrinted):
         return dates_of(self.nights)
 
     @property
+    def exposure_scatter(self) -> np.ndarray:
+        """Of single exposures about their night by degree, pixels a normalised coefficient: (degree,), of all nights.
+
+        Zero for maps.
+        """
+        weight = np.array([each.n_exposures * bool(np.any(each.scatter)) for each in self.nights], dtype=float)
+        squares = np.array([each.scatter**2 for each in self.nights])
+        return np.sqrt(weight @ squares / max(weight.sum(), 1.0))
+
+    @property
     def drifts(self) -> bool:
         """Whether the static distortion changes with time."""
         return self.rate > 0 or self.walk > 0
@@ -241,7 +258,8 @@ class CombinedNights(ShownAsPrinted):
         date : float or `~astropy.time.Time`, optional
             As for `static`.
         """
-        sizes = {"scatter_px": self.scatter.tolist(), "rate_px_yr": self.rate, "walk_px_root_yr": self.walk}
+        sizes = {"scatter_px": self.scatter.tolist(), "exposure_scatter_px": self.exposure_scatter.tolist()}
+        sizes |= {"rate_px_yr": self.rate, "walk_px_root_yr": self.walk}
         named = {"name": self.name, "degree": self.degree, "date": self._year(date) or None, "odd": list(self.odd)}
         return named | sizes | {"modes": records(self.modes(date)), "nights": records(self.table)}
 
@@ -311,6 +329,9 @@ class CombinedNights(ShownAsPrinted):
             drift = f"{self.rate:.2g} px a year, and wanders by {self.walk:.2g} px in the root of a year"
             if self.drifts or len(self.nights) > 2:
                 lines.append(f"A coefficient changes by {drift}." if self.drifts else "No change with time is seen.")
+        if np.any(own := self.exposure_scatter):
+            scatter = ", ".join(f"{each:.2g} (degree {d})" for d, each in enumerate(own, 1))
+            lines.append(f"Exposures scatter about their night by {scatter} px a coefficient.")
         lines += [*self._said_of_odd(), ""]
         lines.append("Normalised Legendre modes, undistorted to detector pixels, shift, rotation and scale taken off:")
         lines += [*self.modes().pformat(max_lines=-1, max_width=-1), *self._said_of_weak()]

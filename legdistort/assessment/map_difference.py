@@ -247,8 +247,7 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
     >>> ld.difference(old, ld.Prior(old.mean * 1.05)).agrees
     True
     """
-    two = _opened(second, degree, "second")
-    one = _opened(first, degree, "first", _shape_of(two[0]))
+    one, two = _both(first, second, degree)
     if (frames := _ends(one[0], two[0])) is not None:  # what lies between them is a part of one map and not the other
         on_sky = {"degree": degree, "frame": SKY}
         try:
@@ -333,6 +332,16 @@ def _measured(thing):
     if isinstance(thing, Solution):
         return fingerprints(thing.residuals)
     return {each.name: each.exposures for each in thing.nights} if isinstance(thing, CombinedNights) else {}
+
+
+def _both(first, second, degree):
+    """Both as `_opened` gives them; one that states no shape has that of the other."""
+    try:
+        one = _opened(first, degree, "first")
+    except InputError:
+        two = _opened(second, degree, "second")
+        return _opened(first, degree, "first", _shape_of(two[0])), two
+    return one, _opened(second, degree, "second", _shape_of(one[0]))
 
 
 def _shape_of(thing):

@@ -18,11 +18,16 @@ def support(rows):
         ``a x + b y + c <= 0`` inside. Where fewer than three stars support no area, no
         pixel is inside.
     """
+    rows = rows[np.asarray(rows["used"], dtype=bool)]
+    return around(np.column_stack([rows["x"].to_value(u.pix), rows["y"].to_value(u.pix)]))
+
+
+def around(xy):
+    """The half-planes of `support` for the hull of positions (n, 2)."""
     from scipy.spatial import ConvexHull, QhullError
 
-    rows = rows[np.asarray(rows["used"], dtype=bool)]
     try:
-        return ConvexHull(np.column_stack([rows["x"].to_value(u.pix), rows["y"].to_value(u.pix)])).equations
+        return ConvexHull(xy).equations
     except (QhullError, ValueError):
         return np.array([[0.0, 0.0, 1.0]])
 

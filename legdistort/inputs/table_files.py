@@ -162,8 +162,9 @@ def _fill_errors(table, error):
         bad = ~(np.isfinite(stated) & (stated > 0))
         table[name] = np.where(bad, error, stated) * u.pix
         filled |= bad
-    number = "all" if filled.all() else f"{filled.sum()} of {len(table)}"  # the same words of every list are said once
-    log.info("%s positions come without an error; it is taken as %g pixels", number, error)
+    if filled.any():  # in the same words of every list, which are said once
+        words = "all" if filled.all() else "some"
+        log.info("%s positions come without an error; it is taken as %g pixels", words, error)
 
 
 def write_stars(solution, path, *, epoch=None, overwrite=False):

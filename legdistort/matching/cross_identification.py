@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..exceptions import InputError
-from ..geometry import similarity
+from ..geometry import similarity, star_hull
 from ..geometry.tangent_plane import TangentPlane, angles, directions
 from ..inputs.references.catalogue import Reference
 from .registration import register
@@ -48,6 +48,10 @@ class Identified:
         stars without one.
     maps, unknown : ndarray, shape (n, 2, m), or None
         What its positions have in common, see `legdistort.inputs.references.catalogue.Reference`; pixels.
+    names : ndarray of str, shape (n,), or None
+        What the reference calls them.
+    missing : tuple of str
+        What it calls others that lie among the stars of the solution, and are none of these.
     """
 
     rows: np.ndarray
@@ -57,6 +61,8 @@ class Identified:
     motion: np.ndarray | None = None
     maps: np.ndarray | None = None
     unknown: np.ndarray | None = None
+    names: np.ndarray | None = None
+    missing: tuple[str, ...] = ()
 
     def subset(self, these):
         """The same with some of its stars."""
@@ -98,12 +104,15 @@ def identify(reference, names, positions, *, flux=None, sky=None, pixel_scale=No
     rows = np.flatnonzero(solved)
     flux = None if flux is None else flux[rows]
     mine, theirs, sky = _pairs(reference, names[rows], positions[rows], flux, sky, pixel_scale)
-    rows, reference = rows[mine], reference.subset(theirs)
+    rows, others = rows[mine], reference.subset(np.setdiff1d(np.arange(len(reference)), theirs))
+    reference = reference.subset(theirs)
     if reference.xy is None and sky is None:
         sky = _tangent_plane(reference, positions[rows])
     found = reference.on_plane(sky)
     _check_agreement(reference.label, positions[rows], found.xy, np.ptp(positions[solved], axis=0).max())
-    return Identified(rows, found.xy, found.covariance, sky, found.motion, found.maps, found.unknown)
+    missing = _missing(others.on_plane(sky), found.xy, positions[rows], positions[solved])
+    common = found.motion, found.maps, found.unknown, found.names
+    return Identified(rows, found.xy, found.covariance, sky, *common, missing)
 
 
 def _pairs(reference, names, positions, flux, sky, pixel_scale):
@@ -202,7 +211,10 @@ def _turned(reference, positions, flux):
 
 
 def _registered(source, target, source_flux, target_flux, near, *, guess):
-    """Rows of source and target by `registration.register`; None if nothing stands out from chance."""
+    """Rows of source and target by `registration.register`; None if nothing stands out from chance.
+
+    The shorter list is laid on the longer one: of a part of the longer most stars may have none in the other.
+    """
     if min(len(source), len(target)) < 5:
         return None
     fluxes = (None, None) if source_flux is None or target_flux is None else (source_flux, target_flux[near])
@@ -210,9 +222,11 @@ def _registered(source, target, source_flux, target_flux, near, *, guess):
     for xy, flux, shift in ((source, fluxes[0], 0.0), (target, fluxes[1], 10.0)):  # so that nothing stands still
         low, span = xy.min(axis=0) - shift, np.ptp(xy, axis=0) + shift
         lists.append((low, StarList(xy - low, np.zeros(len(xy)), tuple(np.ceil(span[::-1]).astype(int) + 1), flux)))
-    (low, stars), (other, catalogue) = lists
-    found = register(stars, catalogue, guess=np.column_stack([np.eye(2), low - other]) if guess else None)
-    return None if found is None else (found.source, found.target)
+    (low, short), (other, long) = sorted(lists, key=lambda each: len(each[1]))
+    found = register(short, long, guess=np.column_stack([np.eye(2), low - other]) if guess else None)
+    if found is None:
+        return None
+    return (found.source, found.target) if short is lists[0][1] else (found.target, found.source)
 
 
 def _neighbours(positions, plane, span):
@@ -264,6 +278,14 @@ def _tangent_plane(reference, positions):
         )
     plane = _middle(reference.sky, 1.0)
     return TangentPlane(plane.lon, plane.lat, similarity.robust_similarity(positions, reference.on_plane(plane).xy))
+
+
+def _missing(others, xy, places, positions):
+    """Names of other stars of a reference that lie among positions (n, 2), by those found at `xy` and their places."""
+    if others.names is None or len(places) < 3:
+        return ()
+    there = similarity.apply(similarity.robust_similarity(xy, places), others.xy)
+    return tuple(others.names[star_hull.supported(star_hull.around(positions), there.T)].tolist())
 
 
 def _check_agreement(label, positions, xy, size, share=0.5):

@@ -19,6 +19,7 @@ from ..results.settings import Settings
 from ..results.solution import Solution
 from ..runtime.checks import LARGEST, check_choice
 from ..runtime.words import CAMERA, DYNAMIC, ERRORS, GAUGES, LOSSES, METHODS, MOTIONS
+from .choices import prior_widths
 from .choices.degree_choice import AUTO
 from .equations.problem import check_error_floor, check_prior
 from .knowledge.known_stars import known_stars
@@ -330,5 +331,10 @@ def check_tie(matches, asked, reference, **tying):
         raise InputError(
             f"{option}={getattr(asked, option)!r} compares exposures with one another, and there is only one ({name}): "
             "leave it out"
+        )
+    if prior_widths.sought(asked.prior):
+        raise InputError(
+            "sigma='evidence' of the prior (--prior-sigma evidence) is found from several exposures, and there is only "
+            f"one ({name}): give widths in pixels (--prior-sigma 0.05), or leave sigma out"
         )
     return catalogue, epoch

@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 from scipy.linalg import block_diag
 
-from ..exceptions import AssumptionWarning, InputError, warn
+from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry import similarity
 from ..geometry.similarity import robust_similarity
 from ..matching.cross_identification import identify
@@ -146,7 +146,7 @@ class ReferenceTie:
                 else "absolute positions may be off by as much; look for mismatched stars, or give a prior",
             )
             rest = ", not settled"
-        made = replace(made, moves=self.identified.maps is not None)
+        made = replace(made, moves=self.identified.maps is not None, labels=self.identified.names)
         identified, made = bent_reference.straightened(self.identified, equations, made, result, self.degree)
         straight = replace(self, identified=identified)
         common, open_maps = straight._of_reference(result.gauge, prior.n_modes, result.state.positions.T)
@@ -462,9 +462,11 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
     identified = _identified(fit, there, pixel_scale)
     lost = len(reference) - len(there)
     why = f"; {lost} are left out: they have no proper motion with errors to take them to {epoch or 0:.2f}"
+    missing = identified.missing if fit.problem.n_fields == 1 else ()
+    told = f"; {len(missing)} more lie among them and are not found: {some_of(missing, 6)}" * bool(missing)
     log.info(
-        "%d of the %d stars of %s are in the exposures%s",
-        len(identified.rows), len(reference), reference.label, why * bool(lost),
+        "%d of the %d stars of %s are in the exposures%s%s",
+        len(identified.rows), len(reference), reference.label, told, why * bool(lost),
     )  # fmt: skip
     of = fit.options
     known = np.all(elimination.inverse_star_blocks(fit.blocks.v)[np.diag(packed(fit.problem.n_star))] > 0, axis=0)

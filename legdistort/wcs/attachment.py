@@ -118,7 +118,8 @@ def attach(
     kind : {"sip", "tpv", "head", None}
         Form of the header; None leaves it alone and adds the ASDF extension only. "head" leaves the frames alone, and
         writes the cards (TPV) of the images of each into a text ``NAME.head``, which SWarp and SCAMP read in the place
-        of its headers: beside the frames, or into the folder `out` without them.
+        of its headers: beside the frames, or into the folder `out` without them. With GAIN and SATURATE, which SWarp
+        reads, where the frames state them under other keywords.
     max_error : float
         Largest error of the header, pixels.
     ext : int, str or (str, int), optional
@@ -320,7 +321,8 @@ def _plan(known, path, target, *, kind, max_error, ext, overwrite):
                 planes = file_images.planes_beside(hdulist, hdulist[image])
                 for number in (image, *(_number(hdulist, plane) for plane in planes)):
                     if kind == "head":
-                        of_images[number] = headers[name]
+                        own = header_texts.detector_cards(hdulist, number) if number == image else fits.Header()
+                        of_images[number] = headers[name] + own
                         continue
                     start, data, stop, _ = spans[number]
                     footprint = renewed_footprint(known.views[name], hdulist, hdulist[number])

@@ -306,6 +306,24 @@ def test_a_camera_makes_the_next_night_absolute(three):
     assert np.nanmedian(known.stars["x_err_abs"].value) < 0.05
 
 
+def test_the_scatter_of_exposures_is_found_and_stated_for_one_alone(tmp_path):
+    """Exposures scatter by as much, degree by degree, as the fields that were drawn."""
+    drawn = np.array([modes(field(np.random.default_rng(seed), 0.05)) for seed in range(500)])
+    combined = ld.combine_nights(campaign(3, 3, single=0.05, exposures=9))
+    of_degree = [np.sqrt(np.mean(drawn[:, :, each] ** 2)) for each in (slice(3, 6), slice(6, 10))]
+    assert_allclose(combined.exposure_scatter[1:], of_degree, rtol=0.25)
+    assert "Exposures scatter about their night by " in str(combined)
+    usual, alone = combined.prior(), combined.prior(one_exposure=True)
+    assert usual.sigma is None
+    assert_array_equal(alone.static_sigma, usual.static_sigma)
+    assert_array_equal(alone.mean, usual.mean)
+    assert_array_equal(alone.sigma[:, 1:3], combined.exposure_scatter[0])
+    assert_array_equal(alone.sigma[:, 3], combined.exposure_scatter[1])  # x^2 or xy: of degree 2 both
+    of_map = ld.combine_nights([static_prior(1)])
+    assert not of_map.exposure_scatter.any()
+    assert of_map.prior(one_exposure=True).sigma is None
+
+
 def test_nights_that_do_not_go_together_are_refused(three, tmp_path):
     with pytest.raises(
         InputError, match="solution 2 has an exposure that solution 1 has too: give every exposure once"

@@ -279,6 +279,23 @@ def test_modes_that_a_night_was_given_and_did_not_fit_do_not_count():
     assert found.agrees
 
 
+def test_a_header_that_states_no_size_has_that_of_the_other_map(tmp_path):
+    """Whichever comes first, as a text ``.head`` has none."""
+    header = fits.Header({"CTYPE1": "RA---TPV", "CTYPE2": "DEC--TPV", "CRVAL1": 10.0, "CRVAL2": -30.0})
+    header.update({"CRPIX1": 256.5, "CRPIX2": 256.5, "CD1_1": -1e-5, "CD1_2": 0.0, "CD2_1": 0.0, "CD2_2": 1e-5})
+    header.update({"PV1_1": 1.0, "PV1_4": 0.5, "PV2_1": 1.0})
+    path = tmp_path / "night.head"
+    path.write_text(header.tostring(sep="\n", endcard=True, padding=False) + "\n")
+    known = ld.Prior.from_file(path, shape=(512, 512))
+    for pair in ((known, path), (path, known)):
+        found = ld.difference(*pair)
+        assert found.rms < 1e-9
+        assert set(found.shapes.values()) == {(512, 512)}
+    assert main(["difference", str(path), str(path)]) == 1
+    with pytest.raises(InputError, match=r"nowhere.head"):
+        ld.difference(tmp_path / "nowhere.head", known)
+
+
 def test_a_file_that_names_its_detector_is_compared_with_that_of_a_camera(tmp_path):
     header = fits.Header({"CTYPE1": "RA---TAN-SIP", "CTYPE2": "DEC--TAN-SIP", "CRVAL1": 10.0, "CRVAL2": -30.0})
     header.update({"CRPIX1": 256.5, "CRPIX2": 256.5, "CD1_1": -1e-5, "CD1_2": 0.0, "CD2_1": 0.0, "CD2_2": 1e-5})

@@ -461,3 +461,15 @@ def test_celestial_axes_have_names():
     sim = simulate_gsaoi_matches(small=True, seed=3)
     wcs = solve(sim.matches, degree=1, clip=None)[sim.matches.names[0]].wcs
     assert tuple(wcs.world_axis_names) == ("ra", "dec")
+
+
+@pytest.mark.parametrize(("missing", "words"), [(0, None), (1, "some positions"), (3, "all positions")])
+def test_the_error_that_is_filled_in_is_told_where_it_is(tmp_path, caplog, missing, words):
+    table = Table({"x": [1.0, 2, 3], "y": [1.0, 2, 3], "x_err": [0.1] * 3, "y_err": [0.1] * 3})
+    table["x_err"][:missing] = 0
+    table.write(tmp_path / "list.csv")
+    with caplog.at_level("INFO"):
+        found = read_table(tmp_path / "list.csv", error=0.02)
+    assert found["x_err"].value.tolist() == [0.02] * missing + [0.1] * (3 - missing)
+    said = [record.getMessage() for record in caplog.records if "without an error" in record.getMessage()]
+    assert said == ([] if words is None else [f"{words} come without an error; it is taken as 0.02 pixels"])

@@ -139,6 +139,17 @@ def test_an_exact_prior_does_not_hold_the_distortion_of_a_single_exposure():
     assert np.sqrt(np.mean(((solution.estimate.positions - true) / stated(solution)) ** 2)) < 1.4
 
 
+@pytest.mark.parametrize(("sigma", "state"), [(None, "unknown"), (0.03, "unknown"), (1e-3, "fail")])
+def test_an_exposure_that_departs_from_its_static_distortion_is_no_bent_reference(sigma, state):
+    """Unless it is said how far exposures depart, and it departs farther."""
+    prior = ld.Prior(np.zeros((2, 10)), static_sigma=0.01, sigma=sigma)
+    solution, *_ = solved(5, static=0.03, prior=prior)
+    check = next(check for check in solution.checks if check.name == "reference")
+    assert check.state == state
+    assert ("one exposure does not tell whether it departs" in check.sentence) == (sigma is None)
+    assert ("--prior-sigma" in check.cure) == (sigma is None)
+
+
 def test_one_exposure_of_a_camera_keeps_the_layout_of_its_headers():
     night = header_layouts.Night(1, off=0.0, n=1)
     table = Table(night.table)
@@ -173,6 +184,8 @@ def test_no_cure_is_named_that_is_refused():
         ({"static": "fit"}, "static='fit' compares exposures"),
         ({"validate": 0.1}, "validate=0.1 compares exposures"),
         ({"motion": "proper"}, "motion='proper' compares exposures"),
+        ({"prior": ld.Prior(np.zeros((2, 10)), sigma="evidence", static_sigma=0.1)}, "only one.*--prior-sigma 0.05"),
+        ({"prior": ld.Prior(None, sigma="evidence")}, "sigma='evidence' of the prior"),
     ],
 )
 def test_options_that_compare_exposures_are_refused(options, words):

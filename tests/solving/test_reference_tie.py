@@ -398,6 +398,32 @@ def test_positions_are_matched_in_the_plane(sim, shift):
     assert_allclose(found.estimate.positions, named.estimate.positions, atol=1e-6)
 
 
+@pytest.mark.parametrize("called", ["source", None])
+def test_stars_of_a_reference_that_are_elsewhere_are_named_by_it(sim, caplog, tmp_path, called):
+    """Those far off are not found, those near are found and rejected; what lies outside the field is not counted."""
+    reference = planar(sim, 40, 0.02, named=False)
+    middle = np.argsort(np.hypot(*(np.column_stack([reference["x"], reference["y"]]) - 1024).T))
+    near, far = middle[[0, 1]], middle[[2, 3, 4]]
+    reference["x"][near] += 1.0
+    reference["y"][far] += 60.0
+    reference.add_row([5000.0, 1000.0, 0.02, 0.02])
+    names = np.array([f"row {row}" for row in range(41)])
+    if called:
+        names = np.array([f"S{7 * row}" for row in range(41)])
+        reference[called] = names
+    with caplog.at_level(logging.INFO, logger="legdistort"):
+        solution = solve(sim.matches, prior=Prior(sim.truth.static), reference=reference)
+    told = next(line for line in caplog.messages if "are in the exposures" in line)
+    assert told.startswith("37 of the 41 stars of the reference are in the exposures; 3 more lie among them and are")
+    assert sorted(told.split(": ")[1].split(", ")) == sorted(names[far])
+    tie = Solution.read(solution.write(tmp_path / "solution.asdf")).gauge.tie
+    assert sorted(tie.labels[~tie.used]) == sorted(names[near])
+    assert all(f"({name})" in tie.sentence for name in names[near])
+    assert tie.rejected == [
+        f"{star} ({name})" for star, name in zip(tie.stars[~tie.used], tie.labels[~tie.used], strict=True)
+    ]
+
+
 @pytest.mark.parametrize("n", [1, 4])
 def test_few_stars_are_matched_to_their_neighbours(sim, n):
     reference = planar(sim, n, 0.02)
@@ -549,6 +575,23 @@ def test_units_masks_and_names_of_vizier(night, tied):
     assert_allclose(solution.estimate.positions, tied.estimate.positions, atol=1e-6)
 
 
+@pytest.mark.parametrize("called", ["{}_err", "e_{}", "{}_unc", "E_{}"])
+def test_errors_that_are_called_otherwise(night, called):
+    plain = gaia(night)
+    names = ("ra", "dec", "pmra", "pmdec")
+    other = plain.copy()
+    for name in names:
+        other.rename_column(f"{name}_error", called.format(name))
+    assert_allclose(read_reference(other).covariance, read_reference(plain).covariance)
+
+
+def test_a_file_is_said_to_have_the_columns_that_it_has(night, tmp_path):
+    table = gaia(night)["ra", "dec"]
+    table.write(tmp_path / "stars.fits")
+    with pytest.raises(InputError, match="it has ra, dec: rename the columns that are these"):
+        read_reference(tmp_path / "stars.fits")
+
+
 def test_stars_without_motion_serve_at_their_own_epoch_only(night):
     table = gaia(night)
     mask = np.zeros(len(table), bool)
@@ -575,7 +618,9 @@ def test_stars_left_out_for_the_want_of_a_motion_are_counted(night, caplog, epoc
         solve(night.matches, prior=Prior(night.truth.static), reference=table, epoch=epoch)
     told = next(line for line in caplog.messages if "of the reference are in the exposures" in line)
     words = f"; {n} are left out: they have no proper motion with errors to take them to {epoch:.2f}"
-    assert re.fullmatch(rf"\d+ of the {len(table)} stars of the reference are in the exposures{words * (n > 0)}", told)
+    missing = r"(; \d+ more lie among them and are not found: [\d, ]+( and \d+ more)?)?"
+    counted = rf"\d+ of the {len(table)} stars of the reference are in the exposures"
+    assert re.fullmatch(rf"{counted}{missing}{words * (n > 0)}", told)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -657,6 +702,7 @@ def change(**columns):
         (lambda t: 3, "reference must be a table, the path of one, or a SkyCoord, got int"),
         (lambda t: change(ra=1.0, dec=95.0, ra_error=1.0, dec_error=1.0)(t), "dec must lie in -90 ... 90 degrees"),
         (lambda t: change(ra=1.0, dec=5.0)(t), "lacks ra_error and dec_error, errors of its positions"),
+        (lambda t: change(ra=1.0, dec=5.0, ra_sd=1.0)(t), "dec, ra_sd: rename the columns .* or state one for all"),
         (change(ra=1.0, dec=5.0, ra_error=1.0, dec_error=1.0, pmra=1.0), "one of pmra, pmdec is missing"),
         (
             change(ra=1.0, dec=5.0, ra_error=1.0, dec_error=1.0, pmra=1.0, pmdec=1.0),

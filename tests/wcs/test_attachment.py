@@ -575,6 +575,35 @@ def test_head_files_have_a_block_for_every_image(geometry, tmp_path):
     assert [each.name for each in (tmp_path / "heads").iterdir()] == ["night.head"]
 
 
+@pytest.mark.parametrize(
+    ("cards", "wanted"),
+    [
+        ({"EGAIN": (2.1, "[e-/ADU]"), "SATLEVEL": 50000.0}, {"GAIN": 2.1, "SATURATE": 50000.0}),
+        ({"EGAIN": 2.1, "GAIN": (100, "setting of the camera")}, {"GAIN": 2.1}),
+        ({"EGAIN": 2.0, "BUNIT": "adu/s", "EXPTIME": 30.0}, {"GAIN": 60.0}),
+        ({"GAIN": 2.1, "SATURATE": 50000.0}, {}),
+        ({"GAIN": (100, "setting of the camera")}, {}),
+        ({}, {}),
+    ],
+)
+@pytest.mark.parametrize("in_extension", [False, True])
+def test_head_files_have_the_gain_that_swarp_looks_for(one, tmp_path, cards, wanted, in_extension):
+    """SWarp knows the keywords GAIN and SATURATE alone, and without a gain COMBINE_TYPE CLIPPED does not clip."""
+    data, header = np.zeros(SHAPE, "f4"), header_of(OLD)
+    if in_extension:
+        flags = fits.ImageHDU(np.zeros(SHAPE, "uint8"), name="DQ")
+        hdus = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(data, header, name="SCI"), flags])
+    else:
+        hdus = fits.HDUList([fits.PrimaryHDU(data, header)])
+    for key, value in cards.items():
+        hdus[0].header[key] = value
+    hdus.writeto(tmp_path / "frame.fits")
+    attach(one, tmp_path / "frame.fits", in_place=True, kind="head")
+    blocks = _blocks(tmp_path / "frame.head")
+    assert {key: blocks[0][key] for key in ("GAIN", "SATURATE") if key in blocks[0]} == wanted
+    assert not {"GAIN", "SATURATE"} & {key for block in blocks[1:] for key in block}
+
+
 def test_head_files_of_packed_frames(one, tmp_path):
     write_frame(tmp_path / "frame.fits")
     (tmp_path / "frame.fits.gz").write_bytes(gzip.compress((tmp_path / "frame.fits").read_bytes()))

@@ -6,9 +6,12 @@ from astropy.io import fits
 
 from ...exceptions import AssumptionWarning, some_of, warn
 from ..exposure_names import exposure_name
+from .statement import read_statement
+from .wcs_cards import header_of_image
 
 #: Endings of such files.
 TEXTS = ".head", ".ahead"
+_COMMENT = 47  # letters that fit beside a number in a card
 _END = re.compile(r"^END *$", re.MULTILINE)
 #: A card without which a text is no header that leads anywhere.
 _FIRST = re.compile(r"^(CTYPE1|SIMPLE) *=", re.MULTILINE)
@@ -36,6 +39,17 @@ def text_of(headers):
     """The text of several headers, in the order of the images of a file."""
     blocks = [[*each.tostring(sep="\n", endcard=False, padding=False).splitlines(), "END"] for each in headers]
     return "".join(f"{line.rstrip()}\n" for block in blocks for line in block)
+
+
+def detector_cards(hdulist, number):
+    """Gain and saturation of an image under the keywords that SWarp reads, where its header has others for these."""
+    data, cards = hdulist[number].data, fits.Header()
+    header = header_of_image(hdulist[0].header, hdulist[number].header)
+    stated = read_statement(header, data, integer=False)
+    for keyword, each in (("GAIN", stated.gain), ("SATURATE", stated.saturation)):
+        if each.value is not None and header.get(keyword) != each.value:
+            cards[keyword] = each.value, f"by {each.source}"[:_COMMENT]
+    return cards
 
 
 def beside(path):

@@ -37,6 +37,13 @@ VIZIER = {
     "e_raj2000": "ra_error", "e_dej2000": "dec_error", "e_radeg": "ra_error", "e_dedeg": "dec_error",
     "_raj2000": "ra", "_dej2000": "dec", "_ra": "ra", "_de": "dec",
 }  # fmt: skip
+#: Errors as other tables call them.
+VIZIER |= {
+    given.format(name): f"{name}_error"
+    for name in ("ra", "dec", "pmra", "pmdec", "parallax") for given in ("{}_err", "e_{}", "{}_unc")
+}  # fmt: skip
+#: Columns with the names that a catalogue gives to its stars, in order of preference, in small letters.
+_NAMES = "source_id", "source", "star", "name", "id"
 #: How the tables of the CDS call the parts of sexagesimal positions, in small letters.
 _PARTS = ("rah", "ram", "ras", "ded", "dem", "des", "de-")
 #: Columns of errors that are not called NAME_error.
@@ -86,6 +93,8 @@ class Reference:
         Displacements that may be in its positions by any amount.
     degree : int or None
         Of a map that belongs to it alone and may be any, shift, rotation and scale aside; None for none.
+    names : ndarray of str, shape (n,), or None
+        What the catalogue calls its stars, or "row 0" and so on.
     """
 
     label: str
@@ -100,6 +109,7 @@ class Reference:
     maps: np.ndarray | None = None
     unknown: np.ndarray | None = None
     degree: int | None = None
+    names: np.ndarray | None = None
 
     def __len__(self):
         return len(self.covariance)
@@ -236,6 +246,8 @@ def read_reference(reference, error=None, degree=None):
     check_stated(error, degree)
     if isinstance(reference, (str, Path)):
         label, table = f"the reference {reference}", read_table(reference)
+        if "exposure" in table.colnames and table["exposure"].info.description == column_contract.OF_FILE:
+            table.remove_column("exposure")  # of what is read as a list of positions
     elif isinstance(reference, Table):
         label, table = "the reference", Table(reference)  # Quantities become columns with a unit
     elif isinstance(reference, SkyCoord):
@@ -260,7 +272,8 @@ def read_reference(reference, error=None, degree=None):
     if made.star is not None and len(np.unique(made.star[good])) < np.count_nonzero(good):
         names, count = np.unique(made.star[good], return_counts=True)
         raise InputError(f"{label} names star {names[count > 1][0]} more than once")
-    return replace(made.subset(good), finds_errors=is_found(error), degree=degree)
+    made = replace(made, names=_names(table), finds_errors=is_found(error), degree=degree)
+    return made.subset(good)
 
 
 def is_found(error):
@@ -445,10 +458,12 @@ def _errors(table, values, unit, label):
     names = [_ERRORS.get(name, f"{name}_error") for name in values]
     missing = [name for name in names if name not in table.colnames]
     if missing:
-        of = "positions" if values[0] in ("x", "ra") else "motions"
+        of, else_ = "motions", "add them, or leave the motions out"
+        if values[0] in ("x", "ra"):
+            of, else_ = "positions", "state one for all (reference_error=, --reference-error)"
         raise InputError(
-            f"{label} lacks {' and '.join(missing)}, errors of its {of} "
-            f"({unit}, standard deviations); it has {', '.join(table.colnames)}"
+            f"{label} lacks {' and '.join(missing)}, errors of its {of} ({unit}, standard deviations); it has "
+            f"{', '.join(table.colnames)}: rename the columns that are these, or {else_}"
         )
     out = np.column_stack([column_contract.values(table, name, unit) for name in names])
     bad = ~(out > 0) & np.isfinite(out)
@@ -492,6 +507,15 @@ def _epochs(table, label):
         except InputError as error:
             raise InputError(f"ref_epoch in row {row}: {error}") from None
     return out
+
+
+def _names(table):
+    """What a catalogue calls its stars, shape (n,), for messages; else the numbers of its rows, from 0."""
+    for name in _NAMES:
+        if name in table.colnames:
+            column = table[name]
+            return np.array([str(each).strip() for each in (text(column) if is_text(column) else column)], dtype=str)
+    return np.array([f"row {row}" for row in range(len(table))], dtype=str)
 
 
 def _star(table):

@@ -112,6 +112,8 @@ class Tie:
         What was taken off its positions.
     freedom : float
         Of the residuals of the exposures, taken by the map: what of it they determine, not the reference.
+    labels : ndarray, shape (n_reference,), or None
+        What the reference calls these stars, in its column of names, else "row 0" and so on.
     """
 
     covariance: np.ndarray = field(metadata=array("2 k", "2 k", unit="pix2", covariance=True))
@@ -130,6 +132,7 @@ class Tie:
     moves: bool = False
     own: OwnMap | None = None
     freedom: float = field(default=0.0, metadata=number(minimum=0))
+    labels: np.ndarray | None = field(default=None, metadata=array("n_reference", holds="names"))
 
     @property
     def rms(self) -> float:
@@ -137,12 +140,21 @@ class Tie:
         return round(float(np.sqrt(np.mean(self.offsets[self.used] ** 2))), 9)
 
     @property
+    def rejected(self) -> list[str]:
+        """Names of the stars that were rejected as mismatched, and in brackets what the reference calls them."""
+        stars, labels = self.stars.astype(str), self.stars if self.labels is None else self.labels
+        return [
+            f"{star} ({label})" if star != label else star
+            for star, label in zip(stars[~self.used], labels.astype(str)[~self.used], strict=True)
+        ]
+
+    @property
     def sentence(self) -> str:
         """What was used, in a sentence."""
-        out = self.stars[~self.used]
+        out = self.rejected
         words = f"tied to {np.count_nonzero(self.used)} stars of a reference, {self.rms:.2g} px rms per axis from it"
         if len(out):
-            named = ", ".join(str(name) for name in out[:6]) + (" ..." if len(out) > 6 else "")
+            named = ", ".join(out[:6]) + (" ..." if len(out) > 6 else "")
             words += f"; {len(out)} rejected as mismatched: {named}"
         return words
 

@@ -89,7 +89,7 @@ def _scatter(name, tie, ratio, solution):
 def _mismatches(name, tie, ratio, solution):
     """Are many of its stars elsewhere?"""
     n, out = len(tie.used), np.count_nonzero(~tie.used)
-    lost = some_of([str(star) for star in tie.stars[~tie.used]], MOST_NAMED)
+    lost = some_of(tie.rejected, MOST_NAMED)
     if not out or special.bdtrc(out - 1, n, GROSS_ERRORS) > FALSE_ALARM:
         return None
     return Check("reference", "warn", out / n, GROSS_ERRORS,
@@ -103,6 +103,11 @@ def _bend(name, tie, ratio, solution):
     if not made.cure and (not made.is_bent or made.bend < NEGLIGIBLE * _error(solution)):
         return None
     by = f" by {made.bend:.2g} px rms" if np.isfinite(made.bend) else ""
+    if len(solution.names) == 1 and not solution.diagnostics.prior_has_widths:
+        return Check("reference", "unknown", made.bend, None,
+                     f"the distortion that {name} gives {solution.names[0]} differs{by} from the static one given: one "
+                     "exposure does not tell whether it departs from that, as exposures do, or the reference is bent",
+                     "state how far single exposures scatter (--prior-sigma); legdistort nights finds it")  # fmt: skip
     found = f"{name} is bent against what the exposures show{by}"
     if made.cure:
         return Check("reference", "fail", made.bend, None,
