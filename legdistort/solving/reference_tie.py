@@ -30,7 +30,7 @@ from .equations.problem import State
 from .equations.star_terms import StarPrior, packed, unpacked
 from .gauge import bent_reference, catalogue_map, catalogue_motions, hierarchy
 from .gauge.catalogue_agreement import agreement
-from .gauge.moved_fields import moved_by, poses_of, similarities
+from .gauge.moved_fields import centred, moved_by, poses_of, similarities
 
 log = logging.getLogger(__name__)
 
@@ -134,7 +134,7 @@ class ReferenceTie:
                 state = _drifted(problem, replace(result, state=state), step)[1]
                 result = self._kept(self.solve(problem, state, hold=True), gauge)
             else:
-                problem = _centred(problem, result, step)
+                problem = centred(problem, result.gauge, step)
                 result = self.solve(problem, state, common=common)
         else:
             log.warning(
@@ -404,15 +404,6 @@ def _solved(before, problem, state, **how):
     result = minimisers.solve_joint(problem, state, **how)
     known = {name: getattr(before, name) for name in ("covariance", "unknown_maps") if problem.floats}
     return replace(result, gauge=replace(result.gauge, **known))
-
-
-def _centred(problem, result, step):
-    """The problem with widths about a mean that is not known moved along with a map."""
-    if not problem.floats:
-        return problem
-    centre = np.zeros_like(problem.prior_mean) if problem.centre is None else problem.centre.copy()
-    centre[:, :, : result.gauge.n_modes] -= (result.gauge.motion @ step).reshape(len(centre), 2, -1)
-    return replace(problem, centre=centre)
 
 
 def _drifted(problem, result, step):

@@ -1,5 +1,7 @@
 """Moving the fields of the reference plane by similarities, which changes no residual."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ...exceptions import InputError, some_of
@@ -53,3 +55,12 @@ def moved_by(problem, state, poses):
         stars[2:4] = np.einsum("nab,bn->an", of_star[:, :, :2], state.stars[2:4])  # motions turn with the plane
         stars[4:] *= np.sqrt(np.linalg.det(of_star[:, :, :2]))
     return State(stars, state.coefficients, similarity.compose(state.poses, similarity.invert(poses)[problem.fields]))
+
+
+def centred(problem, gauge, step):
+    """The problem with widths about a mean that is not known moved along with a map (2 n_modes,) of the plane."""
+    if not problem.floats:
+        return problem
+    centre = np.zeros_like(problem.prior_mean) if problem.centre is None else problem.centre.copy()
+    centre[:, :, : gauge.n_modes] -= (gauge.motion @ step).reshape(len(centre), 2, -1)
+    return replace(problem, centre=centre)
