@@ -121,7 +121,7 @@ class MapDifference(ShownAsPrinted):
             parts.append(part)
         out = vstack(parts) if parts else mode_table(difference=np.zeros((2, 1)), error=np.zeros((2, 1)))
         error = out["error"].value
-        out["significance"] = out["difference"].value / np.where(error == 0, np.inf, error)
+        out["significance"] = out["difference"].value / np.where(error < _EXACT, np.inf, error)
         return out
 
     @property
@@ -215,7 +215,7 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
 
     A map of a file that names its detector is compared with that detector of a camera, and two gwcs that end in other
     frames on the sky. What the detectors of a camera share counts where a reference tied the night, since exposures can
-    take it over.
+    take it over; not beside a camera that was itself found from exposures.
 
     Parameters
     ----------
@@ -275,7 +275,8 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
 
 def _of_maps(one, two):
     """The `MapDifference` of what was opened, as of independent data."""
-    one = known_map(*one, None if isinstance(two[0], Solution) else known_map(*two))
+    alone = not isinstance(two[0], Solution) or two[0].camera.has_focal_plane
+    one = known_map(*one, known_map(*two) if alone else None)
     two = known_map(*two, one)
     if one.label == two.label:
         one, two = replace(one, label=f"{one.label} (first)"), replace(two, label=f"{two.label} (second)")

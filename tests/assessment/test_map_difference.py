@@ -1,6 +1,7 @@
 """Differences of distortion maps and of nights; maps, nights and their truth are made by numpy alone."""
 
 import json
+from dataclasses import replace
 
 import four_detectors
 import gwcs
@@ -263,6 +264,23 @@ def test_what_a_reference_tells_of_a_camera_counts():
     ax = wrong.plot()
     assert "8 directions are not determined, and not drawn" in ax.get_title(loc="left")
     pyplot.close(ax.figure)
+
+
+def test_the_camera_of_a_night_is_that_night_in_a_file_too(tmp_path):
+    """A map that all detectors share is with the exposures, and in no camera that was found from them."""
+    night = tied(2)
+    night.write(tmp_path / "night.asdf")
+    night.camera.write(tmp_path / "camera.asdf")
+    assert np.abs(night.coefficients.mean(axis=0)[:, 3:]).max() > 0.02
+    paths = [tmp_path / "camera.asdf", tmp_path / "night.asdf"]
+    for pair in (paths, paths[::-1]):
+        found = ld.difference(*pair)
+        assert found.agrees
+        assert found.rms < 1e-7
+        assert found.n_undetermined == 14  # shears, and a common quadratic of the plane
+    chips = dict(night.camera.detectors)
+    chips["1"] = replace(chips["1"], static=chips["1"].static + np.eye(2, 6, 3) * 0.2)
+    assert ld.difference(replace(night.camera, detectors=chips), night).sigmas > 8
 
 
 def test_modes_that_a_night_was_given_and_did_not_fit_do_not_count():
