@@ -7,6 +7,7 @@ from astropy import units as u
 from scipy import special
 
 from ..cameras.camera import Camera
+from ..cameras.detector import map_alone, widths_alone
 from ..exceptions import InputError
 from ..geometry import basis, detector_modes
 from ..geometry.similarity import apply, invert
@@ -23,7 +24,6 @@ from ..solving.knowledge.factors import Factor
 from ..solving.knowledge.posterior import Posterior, most_likely
 from ..solving.knowledge.reduced_data import drawn, part_of
 from ..solving.options import SolveOptions
-from ..solving.single_detectors import map_alone
 
 #: A coefficient of 1 px displaces by sqrt(1/8) px rms per axis: b_m has mean square 1/4.
 MEAN_SQUARE = 8
@@ -117,7 +117,7 @@ def _of_camera(camera, label, common=None):
     shapes = {key: each.shape for key, each in camera.detectors.items()}
     widths, covariance = [each.static_sigma for each in camera.detectors.values()], None
     if any(each is not None for each in widths):
-        widths = [_widths(each, statics[key].shape) for key, each in camera.detectors.items()]
+        widths = [widths_alone(each, statics[key].shape[1]) for key, each in camera.detectors.items()]
         covariance = np.diag(np.concatenate([np.minimum(each.ravel(), _NOTHING) ** 2 for each in widths]))
         if n:
             maps = [_common_maps(camera, each, n).reshape(2, n, -1) for each in camera.detectors.values()]
@@ -135,15 +135,6 @@ def _n_found(camera):
         return 0
     highest = max(int(np.flatnonzero(np.any(each, axis=0)).max(initial=0)) for each in sigmas)
     return next(n for n in map(basis.n_modes, range(1, basis.MAX_DEGREE + 1)) if n > highest) if highest else 0
-
-
-def _widths(detector, shape):
-    """Standard deviations (2, n_modes) of the map of a detector."""
-    given = [detector.layout_sigma, detector.static_sigma]
-    layout, static = (
-        np.zeros(shape) if w is None else basis.change_degree(w, basis.degree_of(shape[1])) for w in given
-    )
-    return np.where(np.arange(shape[1]) < 3, np.maximum(layout, static), static)
 
 
 def _of_focal_plane(solution, label):

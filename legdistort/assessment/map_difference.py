@@ -297,6 +297,7 @@ def _of_maps(one, two):
     if not stated:
         covariance = np.zeros((len(values), len(values)))
     power, directions = np.linalg.eigh(covariance)
+    power = np.maximum(power, 0)  # what rounding leaves beside directions of which nothing is known
     determined = power < 1 / DETERMINED
     inside = directions[:, determined]
     pull = inside.T @ values

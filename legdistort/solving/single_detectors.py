@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..cameras.detector import map_alone
 from ..geometry import basis, similarity
 from ..inputs.exposure_names import detector_name
 from ..priors.prior import Prior
@@ -48,20 +49,6 @@ def by_detector(matches, static):
     )
     made.observations.check()
     return made, {key: prior for key, (_, prior) in own.items()}
-
-
-def map_alone(detector):
-    """Similarity (2, 3) from the focal plane to a detector, and coefficients (2, n_modes) of the rest of its map."""
-    t = np.linspace(-1, 1, 9)
-    q = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), detector.shape)
-    pose = similarity.fit_similarity(similarity.apply(similarity.invert(detector.layout), q), q)
-    back = similarity.invert(pose)
-
-    def shift(u, v):
-        place = basis.denormalize(u, v, detector.shape)
-        return (detector.to_pixels(similarity.apply(back, place)) - place).T
-
-    return pose, basis.project(shift, max(basis.degree_of(detector.static.shape[1]), 1))
 
 
 def _known(detector, static):
