@@ -241,7 +241,7 @@ def test_photutils(tmp_path):
 
 @pytest.mark.parametrize("total", [True, False])
 def test_a_catalogue_of_the_jwst_pipeline(tmp_path, total, recwarn):
-    """Of source_catalog: the flux of a star is the total one, else the isophotal; old places on the sky are no result."""
+    """Of source_catalog: the flux of a star is the total one, else the isophotal; old places are no result."""
     flux, xy = np.array([3e-6, 2e-7, 5e-8]), np.array([[10.0, 20.0, 30.0], [5.0, 6.0, 7.0]])
     listed = QTable({"label": [1, 2, 3], "xcentroid": xy[0], "ycentroid": xy[1]})
     listed["sky_centroid"] = SkyCoord([80.1, 80.2, 80.3], [-69.1, -69.2, -69.3], unit="deg")
