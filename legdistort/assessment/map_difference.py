@@ -138,12 +138,13 @@ class MapDifference(ShownAsPrinted):
             return f"the maps of {first} and {second} are not compared: {self.refused}"
         if self.shared:
             return (
-                f"{second} differs from {first} by {self.rms:.2g} px rms; {some_of(list(self.shared), 3)} are in both, "
-                "so that their errors are not independent, and nothing tells how probable that is"
+                f"{second} differs from {first} by {self.rms:.2g} px rms per axis; {some_of(list(self.shared), 3)} are "
+                "in both, so that their errors are not independent, and nothing tells how probable that is"
             )
         if np.isnan(self.p):
             return (
-                f"{second} differs from {first} by {self.rms:.2g} px rms; neither states an error, so no more is known"
+                f"{second} differs from {first} by {self.rms:.2g} px rms per axis; neither states an error, so no more "
+                "is known"
             )
         if not self.dof:
             return f"{second} determines nothing of {first}: give exposures at several rolls, or dithers"
@@ -152,12 +153,13 @@ class MapDifference(ShownAsPrinted):
         if self.agrees:
             which = first if first.startswith("the ") else f"the map of {first}"
             return (
-                f"{which} is still right: {second} differs from it by {self.rms:.2g} px rms, with errors of "
+                f"{which} is still right: {second} differs from it by {self.rms:.2g} px rms per axis, with errors of "
                 f"{self.rms_error:.2g} px ({found})"
             )
         significance = f"{self.sigmas:.1f} sigma" if self.sigmas < 37 else "more than 37 sigma"
         return (
-            f"{second} differs from {first} by {self.rms:.2g} px rms ({significance}), mostly in {self._most}; {found}"
+            f"{second} differs from {first} by {self.rms:.2g} px rms per axis ({significance}), mostly in "
+            f"{self._most}; {found}"
         )
 
     @property
@@ -196,6 +198,9 @@ class MapDifference(ShownAsPrinted):
         lines = [f"{sentence}.", ""]
         if self.refused:
             return "\n".join([*lines, *self.stars.lines()])
+        lines.append(
+            "Difference: coefficients of the second map less those of the first, undistorted to detector pixels."
+        )
         lines.append(f"{'detector':10s} {'axis':4s} {'mode':14s} {'difference [px]':>15s} {'error':>9s} {'sigma':>6s}")
         for row in self.modes:
             mode, error = f"L{row['x_degree']}(x) L{row['y_degree']}(y)", row["error"].value
@@ -275,7 +280,7 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
 
 def _of_maps(one, two):
     """The `MapDifference` of what was opened, as of independent data."""
-    alone = not isinstance(two[0], Solution) or two[0].camera.has_focal_plane
+    alone = not isinstance(two[0], Solution) or (isinstance(one[0], Camera) and two[0].camera.has_focal_plane)
     one = known_map(*one, known_map(*two) if alone else None)
     two = known_map(*two, one)
     if one.label == two.label:

@@ -23,6 +23,7 @@ from astropy.modeling.models import (
 from astropy.table import Table
 from gwcs import coordinate_frames as cf
 from matplotlib import pyplot
+from matplotlib.quiver import QuiverKey
 from night_sets import SIZE, Nights, field
 from numpy.testing import assert_allclose
 from rolled_night import modes, night
@@ -70,6 +71,24 @@ def test_arrows_of_nothing_do_not_look_like_something():
     assert "arrows x 10000" in ax.get_title(loc="left")
     (arrows,) = ax.collections
     assert np.hypot(arrows.U, arrows.V).max() < 1e-3 * SIZE
+    pyplot.close(ax.figure)
+
+
+def test_the_sign_and_the_length_of_arrows_are_stated():
+    """Second minus first; one arrow has a round length that is written beside it, in the scale of the others."""
+    prior = old(1)
+    found = ld.difference(prior, ld.Prior(prior.mean * 1.5, shape=SHAPE))
+    assert_allclose(found.coefficients["1"][:, 3:], 0.5 * prior.mean[:, 3:], atol=0.02)
+    assert "coefficients of the second map less those of the first" in str(found)
+    assert "px rms per axis" in found.sentence
+    ax = found.plot()
+    assert "second minus first" in ax.get_title(loc="left")
+    (arrows,), (key,) = ax.collections, [each for each in ax.get_children() if isinstance(each, QuiverKey)]
+    scale = float(ax.get_title(loc="left").rpartition("arrows x ")[2].split()[0])
+    length, unit = key.text.get_text().split()
+    assert unit == "px"
+    assert scale * float(length) == pytest.approx(key.U)
+    assert 0.4 * np.hypot(arrows.U, arrows.V).max() < key.U <= np.hypot(arrows.U, arrows.V).max()
     pyplot.close(ax.figure)
 
 
