@@ -45,7 +45,7 @@ class Place:
     x, y : float
         Its undistorted centre, pixels of the focal plane: by the layout alone, as the others.
     rotation : float
-        From the focal plane to the detector, degrees.
+        From the focal plane to the detector, degrees: its axes are turned by as much from y to x in the focal plane.
     scale : float
         Detector pixels in one of the focal plane.
     errors : tuple of float or None
