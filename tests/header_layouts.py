@@ -96,10 +96,13 @@ class Night:
     def true_stars(self, solution):
         """Number of the true star (n,) of each star of a solution of its frames, by the place on the detectors."""
         out, residuals = {}, solution.residuals
+        apart = "x_detector" not in residuals.colnames  # exposures of single detectors
+        x, y = ("x", "y") if apart else ("x_detector", "y_detector")
         for i, f in enumerate(self.focal):
             for key, place in zip(KEYS, self.places, strict=True):
-                rows = residuals[(residuals["exposure"] == f"e{i}") & (residuals["detector"] == key)]
-                xy = np.stack([rows["x_detector"].value, rows["y_detector"].value], axis=1)
+                name = f"e{i}-{key}" if apart else f"e{i}"
+                rows = residuals[(residuals["exposure"] == name) & (residuals["detector"] == key)]
+                xy = np.stack([rows[x].value, rows[y].value], axis=1)
                 nearest = np.argmin(np.hypot(*(xy[:, None] - (f @ place[:, :2].T + place[:, 2])).T), axis=0)
                 out.update(zip(np.asarray(rows["star"]), nearest, strict=True))
         return np.array([out[star] for star in solution.stars["star"]])

@@ -7,6 +7,7 @@ from astropy import units as u
 from scipy import special
 
 from ..cameras.camera import Camera
+from ..cameras.detector import map_alone, widths_alone
 from ..exceptions import InputError
 from ..geometry import basis, detector_modes
 from ..geometry.similarity import apply, invert
@@ -23,7 +24,6 @@ from ..solving.knowledge.factors import Factor
 from ..solving.knowledge.posterior import Posterior, most_likely
 from ..solving.knowledge.reduced_data import drawn, part_of
 from ..solving.options import SolveOptions
-from ..solving.single_detectors import map_alone
 
 #: A coefficient of 1 px displaces by sqrt(1/8) px rms per axis: b_m has mean square 1/4.
 MEAN_SQUARE = 8
@@ -59,6 +59,8 @@ class KnownMap:
         Modes beyond are not known.
     is_named : bool
         Whether it is a map of one detector that its file names.
+    common : ndarray, shape (2, n), or None
+        The distortion of the focal plane of a camera, of all exposures, that is a part of the maps.
     """
 
     label: str
@@ -68,6 +70,7 @@ class KnownMap:
     dof: float = np.inf
     degree: int | None = None
     is_named: bool = False
+    common: np.ndarray | None = None
 
     @property
     def highest(self):
@@ -82,7 +85,7 @@ def known_map(thing, label, other=None):
             return _of_focal_plane(thing, label)
         return _of_night(thing, label, next(iter(other.statics.values())) if other else None)
     if isinstance(thing, Camera):
-        return _of_camera(thing, label)
+        return _of_camera(thing, label, other and other.common)
     if not isinstance(thing, Prior):
         return _of_nights(thing, label)
     widths = thing.static_sigma
@@ -101,24 +104,37 @@ def _of_nights(nights, label):
     return KnownMap(nights.name if label.startswith("the ") else label, {"1": static}, {"1": nights.shape}, covariance)
 
 
-def _of_camera(camera, label):
-    """The detectors of a camera, the shear of whose layouts is a part of their maps."""
+def _of_camera(camera, label, common=None):
+    """The detectors of a camera, the shear of whose layouts is a part of their maps.
+
+    One that was found from exposures knows nothing of a map that all its detectors share, which these took over: it is
+    taken as the `common` one (2, n) of what it is compared with.
+    """
     statics = {key: map_alone(each)[1] for key, each in camera.detectors.items()}
+    n = _n_found(camera)
+    if n and common is not None:
+        statics = {key: _whole(camera, each, common[:, :n]) for key, each in camera.detectors.items()}
     shapes = {key: each.shape for key, each in camera.detectors.items()}
     widths, covariance = [each.static_sigma for each in camera.detectors.values()], None
     if any(each is not None for each in widths):
-        widths = [_widths(each, statics[key].shape) for key, each in camera.detectors.items()]
+        widths = [widths_alone(each, statics[key].shape[1]) for key, each in camera.detectors.items()]
         covariance = np.diag(np.concatenate([np.minimum(each.ravel(), _NOTHING) ** 2 for each in widths]))
+        if n:
+            maps = [_common_maps(camera, each, n).reshape(2, n, -1) for each in camera.detectors.values()]
+            whole = [np.pad(each, ((0, 0), (0, max(w.shape[1] - n, 0)), (0, 0)))[:, : w.shape[1]]
+                     for each, w in zip(maps, widths, strict=True)]  # fmt: skip
+            shared = np.concatenate([each.reshape(-1, 2 * n) for each in whole])
+            covariance += _NOTHING**2 * shared @ shared.T
     return KnownMap(camera.name if label.startswith("the ") else label, statics, shapes, covariance)
 
 
-def _widths(detector, shape):
-    """Standard deviations (2, n_modes) of the map of a detector."""
-    given = [detector.layout_sigma, detector.static_sigma]
-    layout, static = (
-        np.zeros(shape) if w is None else basis.change_degree(w, basis.degree_of(shape[1])) for w in given
-    )
-    return np.where(np.arange(shape[1]) < 3, np.maximum(layout, static), static)
+def _n_found(camera):
+    """Number of modes (per axis) of the static distortions that were found from exposures; 0 for another camera."""
+    sigmas = [each.static_sigma for each in camera.detectors.values() if each.layout_covariance is not None]
+    if len(sigmas) < len(camera.detectors) or any(each is None for each in sigmas):
+        return 0
+    highest = max(int(np.flatnonzero(np.any(each, axis=0)).max(initial=0)) for each in sigmas)
+    return next(n for n in map(basis.n_modes, range(1, basis.MAX_DEGREE + 1)) if n > highest) if highest else 0
 
 
 def _of_focal_plane(solution, label):
@@ -138,18 +154,22 @@ def _of_focal_plane(solution, label):
     moved[free.ravel()] += errors.changes
     unseen = ~free | (np.arange(n) < 3)
     covariance = common @ covariance @ common.T + moved @ moved.T + np.diag(_NOTHING**2 * unseen.ravel())
-    statics = {key: _whole(camera, each, mean.reshape(2, n)) for key, each in camera.detectors.items()}
-    return replace(known, statics=statics, covariance=covariance, degree=basis.degree_of(n))
+    degree, common = basis.degree_of(n), mean.reshape(2, n)
+    statics = {key: pointed(_whole(camera, each, common), each.shape) for key, each in camera.detectors.items()}
+    statics = {key: basis.change_degree(each, degree) for key, each in statics.items()}
+    return replace(known, statics=statics, covariance=covariance, degree=degree, common=common)
 
 
 def _whole(camera, detector, common):
-    """Coefficients (2, n) of all that displaces on a detector, with a `common` distortion (2, n) of the focal plane."""
-    degree, back = basis.degree_of(common.shape[1]), invert(detector.layout)
+    """Coefficients of all that displaces on a detector, with a `common` distortion (2, n) of the focal plane."""
+    pose, static = map_alone(detector)
+    degree, back = basis.degree_of(max(static.shape[1], common.shape[1])), invert(pose)
 
     def displacement(u, v):
         q = basis.denormalize(u, v, detector.shape)
         f = apply(back, q)
-        return (detector.to_pixels(f + (common @ basis.values(degree, *basis.normalize(f, camera.field))).T) - q).T
+        modes = basis.values(basis.degree_of(common.shape[1]), *basis.normalize(f, camera.field))
+        return (detector.to_pixels(f + (common @ modes).T) - q).T
 
     return basis.project(displacement, degree)
 

@@ -121,7 +121,7 @@ class MapDifference(ShownAsPrinted):
             parts.append(part)
         out = vstack(parts) if parts else mode_table(difference=np.zeros((2, 1)), error=np.zeros((2, 1)))
         error = out["error"].value
-        out["significance"] = out["difference"].value / np.where(error == 0, np.inf, error)
+        out["significance"] = out["difference"].value / np.where(error < _EXACT, np.inf, error)
         return out
 
     @property
@@ -138,12 +138,13 @@ class MapDifference(ShownAsPrinted):
             return f"the maps of {first} and {second} are not compared: {self.refused}"
         if self.shared:
             return (
-                f"{second} differs from {first} by {self.rms:.2g} px rms; {some_of(list(self.shared), 3)} are in both, "
-                "so that their errors are not independent, and nothing tells how probable that is"
+                f"{second} differs from {first} by {self.rms:.2g} px rms per axis; {some_of(list(self.shared), 3)} are "
+                "in both, so that their errors are not independent, and nothing tells how probable that is"
             )
         if np.isnan(self.p):
             return (
-                f"{second} differs from {first} by {self.rms:.2g} px rms; neither states an error, so no more is known"
+                f"{second} differs from {first} by {self.rms:.2g} px rms per axis; neither states an error, so no more "
+                "is known"
             )
         if not self.dof:
             return f"{second} determines nothing of {first}: give exposures at several rolls, or dithers"
@@ -152,12 +153,13 @@ class MapDifference(ShownAsPrinted):
         if self.agrees:
             which = first if first.startswith("the ") else f"the map of {first}"
             return (
-                f"{which} is still right: {second} differs from it by {self.rms:.2g} px rms, with errors of "
+                f"{which} is still right: {second} differs from it by {self.rms:.2g} px rms per axis, with errors of "
                 f"{self.rms_error:.2g} px ({found})"
             )
         significance = f"{self.sigmas:.1f} sigma" if self.sigmas < 37 else "more than 37 sigma"
         return (
-            f"{second} differs from {first} by {self.rms:.2g} px rms ({significance}), mostly in {self._most}; {found}"
+            f"{second} differs from {first} by {self.rms:.2g} px rms per axis ({significance}), mostly in "
+            f"{self._most}; {found}"
         )
 
     @property
@@ -196,6 +198,9 @@ class MapDifference(ShownAsPrinted):
         lines = [f"{sentence}.", ""]
         if self.refused:
             return "\n".join([*lines, *self.stars.lines()])
+        lines.append(
+            "Difference: coefficients of the second map less those of the first, undistorted to detector pixels."
+        )
         lines.append(f"{'detector':10s} {'axis':4s} {'mode':14s} {'difference [px]':>15s} {'error':>9s} {'sigma':>6s}")
         for row in self.modes:
             mode, error = f"L{row['x_degree']}(x) L{row['y_degree']}(y)", row["error"].value
@@ -215,7 +220,7 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
 
     A map of a file that names its detector is compared with that detector of a camera, and two gwcs that end in other
     frames on the sky. What the detectors of a camera share counts where a reference tied the night, since exposures can
-    take it over.
+    take it over; not beside a camera that was itself found from exposures.
 
     Parameters
     ----------
@@ -274,7 +279,8 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
 
 def _of_maps(one, two):
     """The `MapDifference` of what was opened, as of independent data."""
-    one = known_map(*one, None if isinstance(two[0], Solution) else known_map(*two))
+    alone = not isinstance(two[0], Solution) or (isinstance(one[0], Camera) and two[0].camera.has_focal_plane)
+    one = known_map(*one, known_map(*two) if alone else None)
     two = known_map(*two, one)
     if one.label == two.label:
         one, two = replace(one, label=f"{one.label} (first)"), replace(two, label=f"{two.label} (second)")
@@ -295,6 +301,7 @@ def _of_maps(one, two):
     if not stated:
         covariance = np.zeros((len(values), len(values)))
     power, directions = np.linalg.eigh(covariance)
+    power = np.maximum(power, 0)  # what rounding leaves beside directions of which nothing is known
     determined = power < 1 / DETERMINED
     inside = directions[:, determined]
     pull = inside.T @ values

@@ -23,6 +23,7 @@ MISFIT, TIMES = (0.02, 0.06), (2.5, 10.0)
 #: Deviation in the typical exposure that shows a PSF not to be that of the frames, and that at which the check fails.
 WRONG_PSF = 0.2, 0.4
 _BEYOND = 4.0  # errors by noise
+_MOSAIC = "run without --no-mosaic makes one; where --from repeats that, --forget no-mosaic"
 _NAMED = 6  # exposures in a sentence
 _FEWEST = 4  # exposures, to determine how much they usually differ
 
@@ -124,7 +125,8 @@ def _misfit_checks(misfits):
 def _shapes_check(quality, stacked):
     """Are the stars of all exposures alike?"""
     if not stacked:
-        return Check("images", "unknown", None, None, "no mosaic was made, for which shapes of stars are compared", "")
+        return Check("images", "unknown", None, None, "no mosaic was made, for which shapes of stars are compared",
+                     _MOSAIC)  # fmt: skip
     found = quality.exposures if quality else {}
     if len(found) < _FEWEST:
         frames = f"{len(found)} exposure{'s' * (len(found) != 1)}"
@@ -169,7 +171,7 @@ def _odd_one(values):
 def stack_check(quality, *, moving=False, stacked=True):
     """Is the stack, if there is one, as sharp as its frames? It cannot be where stars are `moving` between them."""
     if not stacked:
-        return Check("sharpness", "unknown", None, BLURRED, "no mosaic was made", "")
+        return Check("sharpness", "unknown", None, BLURRED, "no mosaic was made", _MOSAIC)
     ratio = quality.fwhm_ratio if quality else np.nan
     if not np.isfinite(ratio):
         return Check("sharpness", "unknown", None, BLURRED, "no star could be measured in stack and frames alike", "")

@@ -422,7 +422,7 @@ class Camera(ShownAsPrinted):
     @cached_property
     def headers(self) -> HeaderLayout | None:
         """Whether headers have the detectors where they lie (`legdistort.cameras.header_layout`); None without any."""
-        return compare_headers(self) if self.has_focal_plane else None
+        return compare_headers(self.detectors) if self.has_focal_plane else None
 
     @classmethod
     def from_exposures(

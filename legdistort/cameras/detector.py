@@ -45,7 +45,7 @@ class Place:
     x, y : float
         Its undistorted centre, pixels of the focal plane: by the layout alone, as the others.
     rotation : float
-        From the focal plane to the detector, degrees.
+        From the focal plane to the detector, degrees: its axes are turned by as much from y to x in the focal plane.
     scale : float
         Detector pixels in one of the focal plane.
     errors : tuple of float or None
@@ -221,6 +221,27 @@ class Detector(ShownAsPrinted):
 
     def __repr__(self) -> str:
         return f"<Detector: {self.shape[1]} x {self.shape[0]} px, static distortion {self.rms:.3g} px rms>"
+
+
+def map_alone(detector):
+    """Similarity (2, 3) from the focal plane to a detector, and coefficients (2, n_modes) of the rest of its map."""
+    t = np.linspace(-1, 1, 9)
+    q = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), detector.shape)
+    pose = similarity.fit_similarity(similarity.apply(similarity.invert(detector.layout), q), q)
+    back = similarity.invert(pose)
+
+    def shift(u, v):
+        place = basis.denormalize(u, v, detector.shape)
+        return (detector.to_pixels(similarity.apply(back, place)) - place).T
+
+    return pose, basis.project(shift, max(basis.degree_of(detector.static.shape[1]), 1))
+
+
+def widths_alone(detector, n):
+    """Standard deviations (2, n) of the coefficients of `map_alone`; 0 of what the detector takes as exact."""
+    given = [detector.layout_sigma, detector.static_sigma]
+    layout, static = (np.zeros((2, n)) if w is None else basis.change_degree(w, basis.degree_of(n)) for w in given)
+    return np.where(np.arange(n) < 3, np.maximum(layout, static), static)
 
 
 def _affine(value, name):

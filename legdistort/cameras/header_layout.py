@@ -127,7 +127,7 @@ def _told_error(error):
     return f" +- {error:.1g}" if np.isfinite(error) else ""
 
 
-def compare_headers(camera):
+def compare_headers(detectors):
     """The `HeaderLayout` of a camera; None if headers state nothing of it, or it has no place for two detectors.
 
     Detectors whose places nothing determined are not compared; if there are no others, places are where the layout
@@ -135,17 +135,18 @@ def compare_headers(camera):
 
     Parameters
     ----------
-    camera : Camera
+    detectors : dict
+        ``{id: Detector}``.
     """
-    stated = [key for key, each in camera.detectors.items() if each.header_layout is not None]
-    known = [key for key in stated if np.all(np.isfinite(camera[key].place.errors or 0.0))]
+    stated = [key for key, each in detectors.items() if each.header_layout is not None]
+    known = [key for key in stated if np.all(np.isfinite(detectors[key].place.errors or 0.0))]
     names = known if len(known) > 1 else stated
     if len(names) < 2:
         return None
-    corners = [basis.denormalize(*np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]]), camera[key].shape) for key in names]
+    corners = [basis.denormalize(*np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]]), detectors[key].shape) for key in names]
 
     def places(kind):
-        layouts = [getattr(camera[key], kind) for key in names]
+        layouts = [getattr(detectors[key], kind) for key in names]
         return np.array([similarity.apply(similarity.invert(a), xy) for a, xy in zip(layouts, corners, strict=True)])
 
     stated = places("header_layout")

@@ -368,7 +368,7 @@ EXPANDING = {
     "degree": Option("total degree of the Legendre series (default 5)", type=int),
     "direction": Option("what the source does, where it is not stated", choices=words.DIRECTIONS),
     "origin": Option("coordinate of the first pixel (default 0)", type=int, choices=(0, 1)),
-    "ext": Option("extension of FITS files, header of a text, or place in an ASDF tree", type=extension),
+    "ext": Option("extension of FITS files, header of a text, place in an ASDF tree, id of a detector", type=extension),
     "frame": Option("where to end: frame of a gwcs, or idl or tel of an aperture"),
     "offset": Option(
         "detector pixel (from 0) of the first pixel of a smaller source", type=float, nargs=2, metavar=("X", "Y")

@@ -165,7 +165,8 @@ def read_exposures(
         Extension to read from every file; by default the image, ``SCI`` if one is named so. Planes beside it (``DQ``,
         ``WHT`` and the like) do not count. A name that several extensions have stands for all of them, the detectors of
         a camera: each becomes an `Exposure` ``NAME-ID`` with the ``exposure`` NAME and the ``detector`` ID, which is
-        ``CCDCHIP``, ``DETECTOR``, ``CHIP`` or ``EXTVER`` of its header.
+        ``CCDCHIP``, ``DETECTOR``, ``CHIP`` or ``EXTVER`` of its header. Images without a name are taken so by default
+        where each has an ``EXTVER`` and a ``DETSEC`` of its own, as in the raw files of Gemini.
     dq_good : int, str or sequence of int, optional
         Flags of the DQ plane that are no reason to leave a pixel out, a sum of bits or ``"64,32"``; all others are.
     weight_maps : str, optional
@@ -391,9 +392,12 @@ def expand_paths(paths):
 
 def _parts(sources, ext):
     """``[(extension, id of the detector)]`` to read from every source; None where it is not one of several."""
-    if not isinstance(ext, str):
+    if not (ext is None or isinstance(ext, str)):
         return [[(ext, None)] for _ in sources]
-    return images_of_detectors([_headers_of_images(source) for source in sources], ext)
+    parts = images_of_detectors([_headers_of_images(source) for source in sources], ext)
+    if ext is None and (most := max(map(len, parts))) > 1:
+        log.info("%d images without a name in a file are taken for the detectors of one camera, by DETSEC", most)
+    return parts
 
 
 def _headers_of_images(source):

@@ -44,7 +44,8 @@ def images_of_detectors(files, ext):
     files : list of list of HDU
         The images of every file.
     ext : int, str, (str, int) or None
-        The extension asked for; a name may stand for the images of several detectors.
+        The extension asked for; a name may stand for the images of several detectors, and none for those that have no
+        name but each a place in one array of detectors (`are_unnamed_detectors`).
 
     Returns
     -------
@@ -52,6 +53,8 @@ def images_of_detectors(files, ext):
         ``[(extension, id)]`` for every file; the id is None where it has but one image and no other file has several.
     """
     single = [[(ext, None)] for _ in files]
+    if ext is None and any(map(are_unnamed_detectors, files)):
+        ext = ""
     if not isinstance(ext, str):
         return single
     named = [[hdu for hdu in images if hdu.name == ext.strip().upper()] for images in files]
@@ -66,6 +69,24 @@ def images_of_detectors(files, ext):
         if len(named[k]) == 1:  # an exposure that lacks the other detectors
             found[k] = [part for part in every_id(images, ext) if part[1] in known][:1]
     return [parts or one for parts, one in zip(found, single, strict=True)]
+
+
+def are_unnamed_detectors(images):
+    """Whether images are the detectors of one camera as Gemini writes them: no names, but each a place of its own.
+
+    They are alike but for ``EXTVER`` and the section of the array, ``DETSEC``; the amplifiers of one detector, which
+    have a section each too, share its ``CCDNAME``.
+    """
+    alike = len({plane_shape(hdu) for hdu in images}) == 1 and {hdu.name for hdu in images} == {""}
+    if not alike or not _are_versions(images):
+        return False
+    sections, chips = ([hdu.header.get(key) for hdu in images] for key in ("DETSEC", "CCDNAME"))
+    return None not in sections and all(len(set(each)) == len(images) or each[0] is None for each in (sections, chips))
+
+
+def _are_versions(images):
+    """Whether several images have one name, or none, and an ``EXTVER`` each."""
+    return len({hdu.name for hdu in images}) == 1 < len({hdu.ver for hdu in images}) == len(images)
 
 
 def every_id(images, ext):
@@ -93,7 +114,7 @@ def extension_names(hdulist, path):
 def detector_names(hdulist, path, ext=None):
     """``{name of an exposure: extension}`` for every way to name the detectors of a file, of one extension or all."""
     images = [hdu for hdu in hdulist if is_image(hdu) and not _stands_beside(hdu.name)]
-    kinds = {hdu.name for hdu in images if hdu.name} if ext is None else {ext}
+    kinds = {hdu.name for hdu in images} if ext is None else {ext}
     forms = [part for kind in kinds for part in every_id(images, kind)]
     return {detector_name(exposure_name(path), key): form for form, key in forms}
 
@@ -179,7 +200,9 @@ def find_image(hdulist, ext, label, *, of_several=False):
             candidates = [hdulist[ext]]
         except (KeyError, IndexError):
             present = ", ".join(f"{i} {h.name}".strip() for i, h in enumerate(hdulist))
-            raise DamagedError(f"{label}: no extension {ext!r}; the file has {present}") from None
+            alike = are_unnamed_detectors([hdu for hdu in hdulist if is_image(hdu)])
+            cure = "; its images have no name: leave ext (--ext) out to read all detectors" * alike
+            raise DamagedError(f"{label}: no extension {ext!r}; the file has {present}{cure}") from None
         candidates = [hdu for hdu in candidates if is_image(hdu)]
     else:
         every = [hdu for hdu in hdulist if is_image(hdu)]
@@ -217,6 +240,7 @@ def _listed_images(hdulist, images):
     python = f"({name!r}, {version})" if comma else name
     listed_so = f"{len(images)} images, {', '.join(named)}{more} (ny, nx)"
     advice = f"choose one, such as ext={python} (--ext {forms[0]})"
-    if all(hdu.name == images[0].name != "" for hdu in images) and comma:
-        advice += f", or take all as the detectors of one camera, ext={name!r} (--ext {name})"
+    if _are_versions(images):
+        every = images[0].name
+        advice += f", or take all as the detectors of one camera, ext={every!r} (--ext {every or repr(every)})"
     return f"{listed_so}: {advice}"

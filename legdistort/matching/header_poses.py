@@ -217,7 +217,7 @@ def _is_number(value):
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def sky_by_layout(matches, camera, poses):
+def sky_by_layout(matches, found, poses):
     """Where the reference plane lies on the sky, with detectors where they were found.
 
     The plane is put on the sky by headers, which have the detectors elsewhere: those that agree on where count, one
@@ -227,18 +227,18 @@ def sky_by_layout(matches, camera, poses):
     ----------
     matches : Matches
         With a sky, by headers.
-    camera : Camera
-        As it was found.
+    found : `~legdistort.cameras.header_layout.HeaderLayout` or None
+        Of the camera as it was found.
     poses : ndarray, shape (n_exposures, 2, 3)
 
     Returns
     -------
     `~legdistort.geometry.tangent_plane.TangentPlane`
     """
-    before, after = matches.camera.headers, camera.headers
-    if before is None or after is None:
+    before = matches.camera.headers
+    if before is None or found is None:
         return matches.sky
-    back = similarity.compose(before.similarity, similarity.invert(after.similarity))
+    back = similarity.compose(before.similarity, similarity.invert(found.similarity))
     moves = [similarity.compose(similarity.invert(pose), similarity.compose(back, pose)) for pose in poses]
     return replace(matches.sky, matrix=similarity.compose(matches.sky.matrix, np.mean(moves, axis=0)))
 

@@ -13,6 +13,8 @@ _MOST = 1e4
 def plot_difference(difference, *, ax=None, scale=None):
     """Arrows by which the second map displaces beyond the first, magnified, detectors side by side.
 
+    One below them has its length in detector pixels.
+
     Parameters
     ----------
     difference : `legdistort.assessment.map_difference.MapDifference`
@@ -39,7 +41,12 @@ def plot_difference(difference, *, ax=None, scale=None):
             ax.annotate(key, edge[0], xytext=(5, 5), textcoords="offset points", color=elements.BLUE, parse_math=False)
         if longest > 0:
             places = basis.denormalize(u, v, (ny, nx)) + corner
-            ax.quiver(*places.T, *(scale * fields[key]), angles="xy", scale_units="xy", scale=1, width=2.4e-3)
+            arrows = ax.quiver(*places.T, *(scale * fields[key]), angles="xy", scale_units="xy", scale=1, width=2.4e-3)
+    if longest > 0:
+        low, high = ax.get_ylim()
+        ax.set_ylim(low - 0.05 * size, high)
+        length = elements.round_down(longest)
+        ax.quiverkey(arrows, 0.9, 0.03, scale * length, f"{length:g} px", labelpos="W", coordinates="axes")
     ax.set_aspect("equal")
     ax.set_xlabel("x [pix]")
     ax.set_ylabel("y [pix]")
@@ -48,7 +55,9 @@ def plot_difference(difference, *, ax=None, scale=None):
         False: f"{min(difference.sigmas, 37):.1f} sigma",
         None: difference.why_not,
     }
-    words = f"difference {difference.rms:.2g} px rms ({verdict[difference.agrees]}), arrows x {scale:g}"
+    words = (
+        f"second minus first, {difference.rms:.2g} px rms per axis ({verdict[difference.agrees]}), arrows x {scale:g}"
+    )
     if difference.n_undetermined and difference.agrees is not None:
         words += f"\n{difference.n_undetermined} directions are not determined, and not drawn"
     first, second = (elements.shorten(each) for each in difference.labels)

@@ -370,7 +370,8 @@ class Prior(ShownAsPrinted):
             perhaps those of their errors, Drizzle coefficients, ``gsaoi-1`` ... ``gsaoi-4``,
             ``siaf:INSTRUMENT/APERTURE``. Of maps, what the series leaves out is kept as `table`.
         ext : int, str or (str, int), optional
-            Extension of FITS files, header of a text, or place in the tree of an ASDF file.
+            Extension of FITS files, header of a text, place in the tree of an ASDF file, or id of a detector of a
+            camera or a solution of several.
         frame : str, optional
         **options
             As for `from_model`: shape, direction, origin, degree, parity, offset, sigma, static_sigma.
@@ -443,7 +444,7 @@ class Prior(ShownAsPrinted):
         Raises
         ------
         InputError
-            If it has detectors of several shapes.
+            If it has several detectors: `from_file` takes one of these.
         """
         from .storage import of_solution
 

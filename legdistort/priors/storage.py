@@ -8,8 +8,9 @@ import asdf
 import numpy as np
 
 from ..cameras.camera import Camera
+from ..cameras.detector import map_alone, widths_alone
 from ..cameras.source import check_shape
-from ..exceptions import InputError
+from ..exceptions import InputError, some_of
 from ..geometry import similarity
 from ..geometry.basis import check_degree
 from ..results.nights import found
@@ -65,8 +66,9 @@ def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=No
         where = where[0]
     options = {key: value for key, value in options.items() if value is not None}
     widths = {key: value for key, value in (("sigma", sigma), ("static_sigma", static_sigma)) if value is not None}
-    ready = _ready(where, kind)
+    ready = _ready(where, kind, ext)
     if ready is not None:
+        ext = None if ready.source and ready.source.get("detector") == str(ext) else ext
         given = options | {key: value for key, value in (("ext", ext), ("frame", frame)) if value is not None}
         if "shape" in given and ready.shape in (None, tuple(given["shape"])):
             widths["shape"] = check_shape(given.pop("shape"))
@@ -88,37 +90,52 @@ def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=No
             raise InputError(f"{source.name}: the distortion cannot be evaluated ({error})") from None
 
 
-def _ready(where, kind):
-    """The prior in a file of a prior, a solution or a camera, or a folder of results; None for anything else."""
+def _ready(where, kind, ext):
+    """The prior in a file of a prior, a solution or a camera, or a folder of results; None for anything else.
+
+    Of a camera with several detectors it is the map of that one which `ext` names.
+    """
     if isinstance(where, (str, Path)) and (Path(where) / "solution.asdf").is_file():
         where = Path(where) / "solution.asdf"
     if not isinstance(where, (str, Path)):
         return None
-    kinds = {"legdistort_prior": read_prior, "legdistort": _of_solution, "legdistort_camera": _of_camera}
-    entry = entry_of(where, kinds)
-    return None if entry is None else kinds[entry](where, kind)
-
-
-def _of_camera(path, kind):
-    """The static distortion of a camera of one detector, with its uncertainty."""
-    camera = Camera.read(path)
+    kinds = {"legdistort_prior": partial(read_prior, kind=kind), "legdistort": Solution.read}
+    kinds |= {"legdistort_camera": Camera.read}
+    if (entry := entry_of(where, kinds)) is None:
+        return None
+    found = kinds[entry](where)
+    if entry == "legdistort_prior":
+        return found
+    camera = found if entry == "legdistort_camera" else found.camera
+    source = {"kind": "camera", "name": str(where)}
     if camera.has_focal_plane:
-        raise InputError(
-            f"{path} is camera {camera.name} with several detectors or a layout: give it as camera (--camera)"
-        )
+        return _of_detector(camera, ext, kind, source)
+    if camera is not found:  # of a solution, the static distortion of the exposures of another field
+        return of_solution(found, kind, {"name": str(where), "files": {Path(where).name: found.checksum}})
     (detector,) = camera.detectors.values()
-    given = {"static_sigma": detector.static_sigma, "shape": detector.shape}
-    return kind(detector.static, source={"kind": "camera", "name": str(path)}, **given)
+    return kind(detector.static, static_sigma=detector.static_sigma, shape=detector.shape, source=source)
 
 
-def _of_solution(path, kind):
-    """The static distortion of the exposures of another field."""
-    earlier = Solution.read(path)
-    return of_solution(earlier, kind, {"name": str(path), "files": {Path(path).name: earlier.checksum}})
+def _of_detector(camera, key, kind, source):
+    """The map of one detector of a camera, the shear of its layout and its uncertainty in it."""
+    if str(key) not in camera.detectors:
+        name = source.get("name", "the solution")
+        raise InputError(
+            f"{name} is of camera {camera.name} with a focal plane: give it as camera (--camera), or take the map of "
+            f"one of its detectors, {some_of(list(camera.detectors), 6)}, by its id: Prior.from_file(path, ext=ID), "
+            "legdistort prior --ext ID"
+        )
+    detector = camera[str(key)]
+    mean = map_alone(detector)[1]
+    stated = detector.static_sigma is not None or detector.layout_sigma is not None
+    widths = widths_alone(detector, mean.shape[1]) if stated else None
+    return kind(mean, static_sigma=widths, shape=detector.shape, source=source | {"detector": str(key)})
 
 
 def of_solution(solution, kind, source):
     """See `Prior.from_solution`; with where it is from."""
+    if solution.camera.has_focal_plane:
+        return _of_detector(solution.camera, None, kind, source)  # which says how to choose one
     shapes = set(solution.estimate.shapes.values())
     if len(shapes) > 1:
         name = source.get("name", "the solution")

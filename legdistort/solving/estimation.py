@@ -35,7 +35,7 @@ from .motion_choice import resolve as resolve_motion
 from .options import CLIP, DEGREE, SolveOptions, Unasked, check_detectors, check_tie, prior_as_asked, with_stated
 from .residual_errors.by_brightness import estimate_by_brightness
 from .residual_errors.correlated import estimate_with_correlations
-from .single_detectors import by_detector
+from .single_detectors import by_detector, headers_of_parts
 from .terms.fitting import fit_with
 from .terms.term import of_motion, terms_of
 
@@ -245,7 +245,7 @@ def solve(
     """
     motion, terms = of_motion(motion, terms)
     matches = with_stated(matches, pose_sigma, layout, layout_sigma)
-    matches, prior, static = _of_detectors(matches, prior, layout, static, dynamic)
+    whole, (matches, prior, static) = matches, _of_detectors(matches, prior, layout, static, dynamic)
     sought, prior = _of_camera(matches, prior, model, degree, layout, static, exposure_degree)
     asked = SolveOptions(
         degree=degree, prior=prior, model=model, static=static, layout=layout, layout_sigma=layout_sigma,
@@ -271,7 +271,7 @@ def solve(
         _tell(fit, given)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
         diagnostics = _diagnostics(given, fit, prior, scale, pointing=given.pointing, terms=found(scale), **chosen)
-        fit = _placed(fit, sought, given) if tie is None else tie(fit, scale=scale)
+        fit = _placed(fit, sought, given, whole) if tie is None else tie(fit, scale=scale)
     epoch = given.epoch if epoch is None else epoch
     sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
     found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue), epoch=epoch)
@@ -433,15 +433,21 @@ def _in_camera(matches, options, sought, join):
     return fit, options, {"selection": selection, "motion_scatter": scatter, **errors_found}
 
 
-def _placed(fit, sought, matches):
+def _placed(fit, sought, matches, whole):
     """The fit with motions relative to the mean of the stars.
 
-    Of a camera that was sought with the sky of the headers that have its detectors where they were found.
+    Of a camera that was sought, or whose detectors were taken one by one from `whole` matches, with the sky of the
+    headers that have its detectors where they were found.
     """
     fit = replace(fit, result=star_motions.at_rest(fit.problem, fit.result))
-    if sought is None or matches.sky is None:
+    apart = whole.camera.has_focal_plane and not matches.camera.has_focal_plane
+    if matches.sky is None or (sought is None and not apart):
         return fit
-    sky = sky_by_layout(matches, fit.matches.camera, fit.result.state.poses)
+    headers, poses = fit.matches.camera.headers, fit.result.state.poses
+    if apart:
+        headers = headers_of_parts(whole, dict(zip(fit.problem.names, poses, strict=True)))
+        poses = np.array(list(whole.poses.values()))
+    sky = sky_by_layout(whole if apart else matches, headers, poses)
     return replace(fit, matches=replace(fit.matches, sky=sky))
 
 

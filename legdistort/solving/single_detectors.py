@@ -4,6 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..cameras.detector import map_alone
+from ..cameras.header_layout import compare_headers
+from ..exceptions import AssumptionWarning, warn
 from ..geometry import basis, similarity
 from ..inputs.exposure_names import detector_name
 from ..priors.prior import Prior
@@ -51,18 +54,36 @@ def by_detector(matches, static):
     return made, {key: prior for key, (_, prior) in own.items()}
 
 
-def map_alone(detector):
-    """Similarity (2, 3) from the focal plane to a detector, and coefficients (2, n_modes) of the rest of its map."""
-    t = np.linspace(-1, 1, 9)
-    q = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), detector.shape)
-    pose = similarity.fit_similarity(similarity.apply(similarity.invert(detector.layout), q), q)
-    back = similarity.invert(pose)
+def headers_of_parts(matches, found):
+    """The `HeaderLayout` of detectors that lie where the poses of their exposures have them, in the mean of these.
 
-    def shift(u, v):
-        place = basis.denormalize(u, v, detector.shape)
-        return (detector.to_pixels(similarity.apply(back, place)) - place).T
+    Parameters
+    ----------
+    matches : Matches
+        Of whole exposures.
+    found : dict
+        ``{exposure of one detector: (2, 3)}``.
 
-    return pose, basis.project(shift, max(basis.degree_of(detector.static.shape[1]), 1))
+    Returns
+    -------
+    `~legdistort.cameras.header_layout.HeaderLayout` or None
+
+    Warns
+    -----
+    AssumptionWarning
+        Of headers that have a detector elsewhere: they do not count for the place on the sky.
+    """
+    detectors = {}
+    for key, each in matches.camera.detectors.items():
+        parts = [(found.get(detector_name(name, key)), pose) for name, pose in matches.poses.items()]
+        layouts = [similarity.compose(part, similarity.invert(pose)) for part, pose in parts if part is not None]
+        if layouts:
+            placed = {"layout": np.mean(layouts, axis=0), "layout_sigma": None, "layout_covariance": None}
+            detectors[key] = replace(each, **placed)
+    headers = compare_headers(detectors)
+    if headers is not None and (words := headers.sentence("the stars put it")):
+        warn(f"{words}; the place on the sky, its scale and its rotation are by those that agree", AssumptionWarning)
+    return headers
 
 
 def _known(detector, static):

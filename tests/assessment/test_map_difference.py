@@ -1,6 +1,7 @@
 """Differences of distortion maps and of nights; maps, nights and their truth are made by numpy alone."""
 
 import json
+from dataclasses import replace
 
 import four_detectors
 import gwcs
@@ -22,6 +23,7 @@ from astropy.modeling.models import (
 from astropy.table import Table
 from gwcs import coordinate_frames as cf
 from matplotlib import pyplot
+from matplotlib.quiver import QuiverKey
 from night_sets import SIZE, Nights, field
 from numpy.testing import assert_allclose
 from rolled_night import modes, night
@@ -69,6 +71,24 @@ def test_arrows_of_nothing_do_not_look_like_something():
     assert "arrows x 10000" in ax.get_title(loc="left")
     (arrows,) = ax.collections
     assert np.hypot(arrows.U, arrows.V).max() < 1e-3 * SIZE
+    pyplot.close(ax.figure)
+
+
+def test_the_sign_and_the_length_of_arrows_are_stated():
+    """Second minus first; one arrow has a round length that is written beside it, in the scale of the others."""
+    prior = old(1)
+    found = ld.difference(prior, ld.Prior(prior.mean * 1.5, shape=SHAPE))
+    assert_allclose(found.coefficients["1"][:, 3:], 0.5 * prior.mean[:, 3:], atol=0.02)
+    assert "coefficients of the second map less those of the first" in str(found)
+    assert "px rms per axis" in found.sentence
+    ax = found.plot()
+    assert "second minus first" in ax.get_title(loc="left")
+    (arrows,), (key,) = ax.collections, [each for each in ax.get_children() if isinstance(each, QuiverKey)]
+    scale = float(ax.get_title(loc="left").rpartition("arrows x ")[2].split()[0])
+    length, unit = key.text.get_text().split()
+    assert unit == "px"
+    assert scale * float(length) == pytest.approx(key.U)
+    assert 0.4 * np.hypot(arrows.U, arrows.V).max() < key.U <= np.hypot(arrows.U, arrows.V).max()
     pyplot.close(ax.figure)
 
 
@@ -263,6 +283,23 @@ def test_what_a_reference_tells_of_a_camera_counts():
     ax = wrong.plot()
     assert "8 directions are not determined, and not drawn" in ax.get_title(loc="left")
     pyplot.close(ax.figure)
+
+
+def test_the_camera_of_a_night_is_that_night_in_a_file_too(tmp_path):
+    """A map that all detectors share is with the exposures, and in no camera that was found from them."""
+    night = tied(2)
+    night.write(tmp_path / "night.asdf")
+    night.camera.write(tmp_path / "camera.asdf")
+    assert np.abs(night.coefficients.mean(axis=0)[:, 3:]).max() > 0.02
+    paths = [tmp_path / "camera.asdf", tmp_path / "night.asdf"]
+    for pair in (paths, paths[::-1]):
+        found = ld.difference(*pair)
+        assert found.agrees
+        assert found.rms < 1e-7
+        assert found.n_undetermined == 14  # shears, and a common quadratic of the plane
+    chips = dict(night.camera.detectors)
+    chips["1"] = replace(chips["1"], static=chips["1"].static + np.eye(2, 6, 3) * 0.2)
+    assert ld.difference(replace(night.camera, detectors=chips), night).sigmas > 8
 
 
 def test_modes_that_a_night_was_given_and_did_not_fit_do_not_count():

@@ -8,6 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from legdistort.assessment import baselines, stack_quality
+from legdistort.assessment.run_checks import image_check, stack_check
 from legdistort.assessment.stack_quality import SINGLE, assess, compare_stacks
 from legdistort.assessment.star_shapes import measure_shapes
 from legdistort.exceptions import InputError
@@ -316,3 +317,10 @@ def test_report_has_the_stacks(stacks, solution, monkeypatch):
     assert f"Stars in the mosaic</th><td>{made.qualities[SINGLE].n_stars} stars: FWHM" in page
     assert "a common map of degree" in page or "a common similarity" in page
     assert "Stacks compared" not in report.render(solution)
+
+
+def test_without_a_mosaic_the_option_that_makes_one_is_named():
+    """Also where it is repeated from an earlier run, by the word that leaves it out."""
+    checks = [stack_check(None, stacked=False), image_check(None, stacked=False)]
+    assert [check.state for check in checks] == 2 * ["unknown"]
+    assert all(check.cure.endswith("--forget no-mosaic") and "without --no-mosaic" in check.cure for check in checks)

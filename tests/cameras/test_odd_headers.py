@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import legdistort as ld
-from legdistort.exceptions import FoldError, LegdistortWarning, SolveError
+from legdistort.exceptions import AssumptionWarning, FoldError, LegdistortWarning, SolveError
 from legdistort.reporting.summary import summarise
 from legdistort.solving import camera_fit
 
@@ -141,6 +141,19 @@ def test_it_has_no_vote_on_the_sky_whatever_is_fitted(night, matches, options):
     assert figures["3"]["header_x_off_px"] == pytest.approx(ODD[0], abs=8)
     assert figures["3"]["header_turned_deg"] == pytest.approx(ODD[2], abs=0.3)
     assert np.hypot(figures["1"]["header_x_off_px"], figures["1"]["header_y_off_px"]) < 8
+
+
+def test_it_has_none_where_detectors_are_taken_one_by_one(night, matches):
+    """With its vote the sky was 12 px off, its scale by 0.35 %: every detector has poses of its own."""
+    with pytest.warns(AssumptionWarning, match=r"headers have detector 3 4\d px \(.* agree to .* by those that agree"):
+        solution = ld.solve(matches, dynamic="detector")
+    assert sky_error(night, solution) < 4.0
+    right = night.sky[night.true_stars(solution)] * [-1, 1] * header_layouts.ARCSEC / 3600
+    found = np.column_stack([solution.stars["ra"].value * np.cos(np.radians(-20.0)), solution.stars["dec"].value])
+    z, w = ((each - each.mean(axis=0)) @ [1, 1j] for each in (right, found))
+    factor = np.vdot(z, w) / np.vdot(z, z)
+    assert abs(factor) == pytest.approx(1, abs=3e-3)
+    assert np.degrees(np.angle(factor)) == pytest.approx(0, abs=0.1)
 
 
 def test_it_has_none_where_the_camera_is_given(night, tmp_path):

@@ -10,6 +10,7 @@ import legdistort as ld
 from legdistort.cli.parser import main
 from legdistort.coaddition.grids import read_grid
 from legdistort.exceptions import InputError
+from legdistort.inputs.file_images import detector_names, find_image
 
 SHAPE = (256, 256)
 
@@ -45,6 +46,55 @@ def test_several_images_are_refused_with_their_list(tmp_path, read, names, told,
     assert ("as the detectors of one camera, ext='SCI' (--ext SCI)" in message) == (names[0][0] == "SCI")
     (chosen,) = read(path, ext=ext)
     assert np.array_equal(chosen.read().data, pixels(2 if len(names) == 4 else 1))
+
+
+def gemini_file(path, *, names=("", "", "", ""), section="DETSEC", chips="1234"):
+    """A raw frame of GSAOI: four images without a name, with EXTVER and their sections of the array."""
+    hdus = [fits.PrimaryHDU(header=fits.Header({"INSTRUME": "GSAOI", "EXPTIME": 30.0}))]
+    for k, (name, corner) in enumerate(zip(names, ("257:512,1:256", "1:256,1:256", "1:256,257:512", "257:512,257:512"),
+                                           strict=True)):  # fmt: skip
+        cards = {"EXTVER": k + 1, "CCDSEC": "[1:256,1:256]", "CCDNAME": f"H2RG-{chips[k]}", section: f"[{corner}]"}
+        hdus.append(fits.ImageHDU(pixels(k), fits.Header(cards), name or None))
+    fits.HDUList(hdus).writeto(path)
+    return path
+
+
+@pytest.mark.parametrize("read", [ld.read_exposures, ld.open_exposures])
+def test_images_without_a_name_are_detectors_by_their_sections(tmp_path, caplog, read):
+    """As raw frames of Gemini have them: read as if they were called SCI, and found again by `attach`."""
+    raw = gemini_file(tmp_path / "S20260412S0101.fits")
+    with caplog.at_level("INFO"):
+        found = read(raw)
+    assert "4 images without a name in a file are taken for the detectors of one camera, by DETSEC" in caplog.text
+    named = read(gemini_file(tmp_path / "named.fits", names=["SCI"] * 4), ext="SCI")
+    assert [each.detector for each in found] == [each.detector for each in named] == ["1", "2", "3", "4"]
+    assert [each.name for each in found] == [f"S20260412S0101-{k}" for k in range(1, 5)]
+    assert {each.exposure for each in found} == {"S20260412S0101"}
+    for k, each in enumerate(found):
+        assert_array_equal(each.read().data, pixels(k))
+    with fits.open(raw) as hdulist:
+        images = {name: find_image(hdulist, form, "raw") for name, form in detector_names(hdulist, raw).items()}
+        for k in range(4):
+            assert images[f"S20260412S0101-{k + 1}"] is hdulist[k + 1]
+    plain = tmp_path / "one.fits"
+    fits.writeto(plain, pixels(9))
+    assert [each.name for each in read([raw, plain])] == [each.name for each in found] + ["one"]
+    with pytest.raises(InputError, match=r"'SCI'; the file has .*: leave ext \(--ext\) out to read all detectors"):
+        read(raw, ext="SCI")
+
+
+@pytest.mark.parametrize(
+    "settings", [{"section": "BIASSEC"}, {"chips": "1122"}, {"names": ["A", "B", "C", "D"]}], ids=["none", "amps", "AB"]
+)
+def test_what_may_not_be_detectors_is_asked_for(tmp_path, settings):
+    """No sections, amplifiers of two detectors, names: one image is chosen, or all by their name, if it is one."""
+    path = gemini_file(tmp_path / "raw.fits", **settings)
+    with pytest.raises(InputError, match="holds 4 images") as error:
+        ld.read_exposures(path)
+    every = "take all as the detectors of one camera, ext='' (--ext '')" in str(error.value)
+    assert every == ("names" not in settings)
+    if every:
+        assert len(ld.read_exposures(path, ext="")) == 4
 
 
 def test_a_long_list_is_cut(tmp_path):

@@ -4,6 +4,8 @@ import gzip
 
 import numpy as np
 import pytest
+from astropy import units as u
+from astropy.coordinates import SkyCoord
 from astropy.io import ascii as astropy_ascii
 from astropy.table import QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
@@ -12,6 +14,7 @@ import legdistort as ld
 from legdistort.cli import parser
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs import column_contract
+from legdistort.inputs.plain_columns import plain_columns
 from legdistort.inputs.references.catalogue import read_reference
 from legdistort.inputs.table_files import read_table
 from legdistort.matching.matches import Matches
@@ -234,6 +237,26 @@ def test_photutils(tmp_path):
     assert_allclose(out["flux"], [900, 500], rtol=0.05)
     assert np.all((out["x_err"].value > 0.001) & (out["x_err"].value < 0.1))
     assert out["flags"].tolist() == [0, Flag.NOT_CONVERGED]
+
+
+@pytest.mark.parametrize("total", [True, False])
+def test_a_catalogue_of_the_jwst_pipeline(tmp_path, total, recwarn):
+    """Of source_catalog: the flux of a star is the total one, else the isophotal; old places are no result."""
+    flux, xy = np.array([3e-6, 2e-7, 5e-8]), np.array([[10.0, 20.0, 30.0], [5.0, 6.0, 7.0]])
+    listed = QTable({"label": [1, 2, 3], "xcentroid": xy[0], "ycentroid": xy[1]})
+    listed["sky_centroid"] = SkyCoord([80.1, 80.2, 80.3], [-69.1, -69.2, -69.3], unit="deg")
+    if total:
+        listed["aper_total_flux"], listed["aper_total_flux_err"] = flux * u.Jy, 0.01 * flux * u.Jy
+    listed["isophotal_flux"], listed["isophotal_flux_err"] = 0.9 * flux * u.Jy, 0.02 * flux * u.Jy
+    listed["is_extended"] = [False, True, False]
+    listed.write(tmp_path / "a_cat.ecsv")
+    out = read_table(tmp_path / "a_cat.ecsv", error=0.02)
+    assert "sky_centroid" not in out.colnames
+    assert_allclose(out["x"].value, xy[0])
+    assert_allclose(out["flux"], flux * (1 if total else 0.9))
+    assert_allclose(out["flux_err"], flux * (0.01 if total else 0.02))
+    plain_columns(column_contract.check(out, column_contract.DETECTED, "t"))
+    assert not recwarn.list
 
 
 def test_names_of_columns_between_other_comments(tmp_path):

@@ -13,6 +13,7 @@ from legdistort.exceptions import AssumptionWarning
 from legdistort.geometry import similarity
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.matching.header_poses import HeaderPoses
+from legdistort.results.errors.header_pointing import HeaderPointing
 
 SHAPE = (300, 300)
 SHIFTS = np.array([[0, 0], [14, 5], [-9, 13], [6, -15], [-13, -8], [11, 12]], float)
@@ -134,3 +135,10 @@ def test_where_no_majority_agrees_the_groups_are_named():
     made = told(stated)
     assert (made.n_used, made.groups) == (0, (("e0", "e1"), ("e2", "e3")))
     assert made.sentence.endswith("(headers that agree with one another: e0, e1 | e2, e3)")
+
+
+def test_what_absolute_errors_leave_out_of_a_sky_by_headers():
+    """Pointing and rotation by their scatter, and the scale, in which headers of one instrument do not scatter."""
+    words = HeaderPointing(5, 0.5, 0.01).error(0.02)
+    assert words.startswith("their scatter leaves its pointing known to 10 mas per axis, its rotation to 0.01 deg")
+    assert words.endswith("the error of its scale, which is as they state it, ra_error_abs and dec_error_abs leave out")

@@ -1,5 +1,6 @@
 """Static distortions as FITS maps with maps of their errors, in and out. Truth made by numpy alone."""
 
+import four_detectors
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -277,3 +278,39 @@ def test_the_static_of_a_solution_with_its_errors(tmp_path):
     assert_allclose(np.sqrt(np.sum(prior.static_sigma**2) / 8), everywhere, rtol=0.05)
     known = ld.Prior.from_solution(solution)
     assert_array_equal([fits.getdata(each) for each in write_maps(known, tmp_path / "t.fits", solution=solution)], maps)
+
+
+def test_the_map_of_one_detector_of_a_camera(tmp_path, capsys):
+    """Of a solution and of its camera in a file, by the id; without one it is refused (it was a map of zeros)."""
+    night = ld.solve(four_detectors.matches("static", 1), static="fit", layout="fit", degree=2)
+    results, camera = night.write(tmp_path / "solution.asdf").parent, tmp_path / "camera.asdf"
+    night.camera.write(camera)
+    rng = np.random.default_rng(1)  # as in four_detectors
+    rng.uniform(size=(160, 2)), rng.normal(size=4), rng.normal(size=(4, 2))
+    bend, size = rng.normal(size=(4, 2, 3)), four_detectors.SIZE
+    x, y = np.meshgrid(*2 * [2 * (np.arange(0, size, 32) + 0.5) / size - 1])
+    plane = np.stack([np.ones(x.size), x.ravel(), y.ravel()], axis=1)
+    found = {}
+    for key in "02":
+        assert main(["prior", str(results), "--ext", key, "--out", str(tmp_path / f"chip{key}.fits")]) == 0
+        found[key] = np.stack(
+            [fits.getdata(p)[::32, ::32].ravel() for p in map_paths(tmp_path / f"chip{key}.fits")[:2]]
+        )
+        errors = [fits.getdata(p) for p in map_paths(tmp_path / f"chip{key}.fits")[2:]]
+        assert 0.001 < np.min(errors) <= np.max(errors) < 0.2
+        prior = ld.Prior.from_file(camera, ext=int(key))
+        assert prior.source == {"kind": "camera", "name": str(camera), "detector": key}
+        assert_array_equal(prior.mean, ld.Prior.from_file(results, ext=key).mean)
+    # what all share the exposures may have, and a linear map the layout; from the pixels to the undistorted places
+    apart = found["2"] - found["0"] + (bend[2] - bend[0]) @ np.stack([x**2, x * y, y**2]).reshape(3, -1)
+    left = apart.T - plane @ np.linalg.lstsq(plane, apart.T, rcond=None)[0]
+    assert np.sqrt(np.mean(left**2)) < 0.02
+    wanted = r"is of camera FOUR with a focal plane: give it as camera .* detectors, 0, 1, 2, 3, by its id: .* --ext ID"
+    for where, ext in ((results, None), (camera, None), (results, "SCI")):
+        with pytest.raises(InputError, match=wanted):
+            ld.Prior.from_file(where, ext=ext)
+    with pytest.raises(InputError, match=wanted):
+        ld.Prior.from_solution(night)
+    capsys.readouterr()
+    assert main(["prior", str(results), "--out", str(tmp_path / "zeros.fits")]) == 1
+    assert "legdistort prior --ext ID" in capsys.readouterr().err

@@ -4,9 +4,11 @@ import warnings
 
 import dense_model
 import drawn_sets
+import four_detectors
 import made_catalogues
 import numpy as np
 import pytest
+from astropy.table import Table
 from numpy.testing import assert_allclose
 from scipy import stats
 
@@ -217,6 +219,23 @@ def test_the_degree_that_is_named_cures(degree):
     cured = check_of(ld.solve(matches, prior=prior, reference=table, reference_degree=degree))
     assert cured.state in ("unknown", "pass")
     assert "agree with the exposures" in cured.sentence
+
+
+@pytest.mark.parametrize("options", [{}, {"layout": "fit"}])
+def test_detectors_that_are_distorted_are_to_be_fitted(options):
+    """Nothing was given of their distortions that could be left out; with these fitted the reference agrees."""
+    matches, rng = four_detectors.matches("static", 2, n=6, n_stars=160), np.random.default_rng(2)
+    xy = rng.uniform(-400, 2 * (four_detectors.SIZE + four_detectors.GAP) + 340, (160, 2))[:60]  # as in four_detectors
+    xy = xy + 0.05 * np.random.default_rng(3).normal(size=xy.shape)
+    known = Table({"star": np.arange(60).astype(str), "x": xy[:, 0], "y": xy[:, 1], "x_err": np.full(60, 0.05),
+                   "y_err": np.full(60, 0.05)})  # fmt: skip
+    with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        check = check_of(ld.solve(matches, degree=2, reference=known, **options))
+        cured = check_of(ld.solve(matches, degree=2, reference=known, layout="fit", static="fit"))
+    assert check.state == "fail"
+    assert "else --static fit, which finds the distortions of single detectors" in check.cure
+    assert "given" not in check.cure
+    assert cured.state in ("unknown", "pass")
 
 
 def test_a_map_of_its_own_is_written_and_read(tmp_path):

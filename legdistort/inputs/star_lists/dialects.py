@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from astropy.coordinates import SkyCoord
 
 from ...exceptions import InputError
 from ..column_contract import values
@@ -70,7 +71,8 @@ def _photutils_flags(table):
 
 
 #: FlyStar and StarFinder; hst1pass (Anderson 2022, WFC3 ISR 2022-05), whose X, Y are x, y after the correction for
-#: charge transfer, u, v and U, V those without distortion; DAOPHOT of Stetson and of IRAF; photutils.
+#: charge transfer, u, v and U, V those without distortion; DAOPHOT of Stetson and of IRAF; photutils;
+#: the step source_catalog of the JWST pipeline, whose total flux is that of stars.
 DIALECTS = (
     Dialect(
         "StarFinder, FlyStar",
@@ -97,6 +99,16 @@ DIALECTS = (
         {"x": ("x_fit",), "y": ("y_fit",), "flux": ("flux_fit",), "flux_err": ("flux_err",)},
         ("x_fit", "y_fit"),
         flags=_photutils_flags,
+    ),
+    Dialect(
+        "the JWST pipeline",
+        {
+            "x": ("xcentroid",),
+            "y": ("ycentroid",),
+            "flux": ("aper_total_flux", "isophotal_flux"),
+            "flux_err": ("aper_total_flux_err", "isophotal_flux_err"),
+        },
+        ("xcentroid", "ycentroid", "isophotal_flux"),
     ),
     Dialect("photutils", {"x": ("xcentroid",), "y": ("ycentroid",)}, ("xcentroid", "ycentroid")),
     Dialect("photutils", {"x": ("x_centroid",), "y": ("y_centroid",)}, ("x_centroid", "y_centroid")),
@@ -145,7 +157,7 @@ def understand(table, columns, *, without_errors=False):
     Returns
     -------
     table : `~astropy.table.Table`
-        The same, with columns added where they had to be worked out.
+        The same, with columns added where they had to be worked out, without places on the sky by a header.
     columns : dict
         The caller's, with those that were understood.
     origin : int
@@ -174,6 +186,9 @@ def understand(table, columns, *, without_errors=False):
     if dialect.program == "hst1pass":
         _check_pixels(found, columns, present)
     log.info("columns of %s: %s", dialect.program, ", ".join(f"{ours} = {theirs}" for ours, theirs in found.items()))
+    sky = [name for name in table.colnames if isinstance(table[name], SkyCoord)]  # of objects, which files cannot hold
+    if sky:
+        table = table[[name for name in table.colnames if name not in sky]]
     flags = dialect.flags(table)
     if flags is not None and "flags" not in columns:
         table = table.copy(copy_data=False)

@@ -75,6 +75,6 @@ class HeaderPointing:
         size = f"{error:.2g}" if error < 100 else f"{error:.0f}"
         turn = f", its rotation to {self.turn:.2g} deg" if np.isfinite(self.turn) else ""
         return (
-            f"their scatter leaves its pointing known to {size} mas per axis{turn}, "
-            "which ra_error_abs and dec_error_abs leave out"
+            f"their scatter leaves its pointing known to {size} mas per axis{turn}; this and the error of its scale, "
+            "which is as they state it, ra_error_abs and dec_error_abs leave out"
         )

@@ -101,7 +101,7 @@ def _headers_by_group(solution):
     camera, words = solution.camera, []
     for group in camera.groups(solution.residuals[np.asarray(solution.residuals["used"], dtype=bool)]):
         exact = {key: replace(camera[key], layout_sigma=None, layout_covariance=None) for key in group}
-        headers = compare_headers(replace(camera, detectors=exact)) if len(group) > 1 else None
+        headers = compare_headers(exact) if len(group) > 1 else None
         words += [headers.sentence("the stars have them")] if headers is not None and headers.scatter > LEAST else []
     words = [each for each in words if each]
     return Check("camera", "warn", None, None, "; ".join(words), _UNDECIDED) if words else None

@@ -112,9 +112,17 @@ def _bend(name, tie, ratio, solution):
     if made.cure:
         return Check("reference", "fail", made.bend, None,
                      f"{found}; with a map of its own, of degree {made.cure}, it agrees with them",
-                     f"--reference-degree {made.cure}, if it is the reference that is bent; else leave out the static "
-                     "distortion given")  # fmt: skip
+                     f"--reference-degree {made.cure}, if it is the reference that is bent{_otherwise(solution)}")
     more = np.sqrt(made.bend_chi2 / made.bend_dof)
     return Check("reference", state_of(made.p), made.bend, None, f"{found} ({more:.2g} times the errors of both)",
-                 "its positions have a distortion of their own, or the static distortion given is not that of these "
-                 "exposures: leave one of them out")  # fmt: skip
+                 f"its positions have a distortion of their own: leave it out{_otherwise(solution)}")  # fmt: skip
+
+
+def _otherwise(solution):
+    """What else to do where a reference and the exposures contradict each other, in words; empty for nothing."""
+    camera, errors = solution.camera, solution.estimate.uncertainty.camera
+    if camera.has_focal_plane and (errors is None or not errors.free[:, :, 3:].any()):
+        return "; else --static fit, which finds the distortions of single detectors"
+    if camera.has_focal_plane or solution.gauge.static not in ("exact", "uncertain"):
+        return ""
+    return "; else leave out the static distortion given, which is not that of these exposures"
