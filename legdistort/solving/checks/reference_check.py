@@ -110,9 +110,14 @@ def _bend(name, tie, ratio, solution):
                      "state how far single exposures scatter (--prior-sigma); legdistort nights finds it")  # fmt: skip
     found = f"{name} is bent against what the exposures show{by}"
     if made.cure:
-        return Check("reference", "fail", made.bend, None,
-                     f"{found}; with a map of its own, of degree {made.cure}, it agrees with them",
-                     f"--reference-degree {made.cure}, if it is the reference that is bent{_otherwise(solution)}")
+        return Check(
+            "reference",
+            "fail",
+            made.bend,
+            None,
+            f"{found}; with a map of its own, of degree {made.cure}, it agrees with them",
+            f"--reference-degree {made.cure}, if it is the reference that is bent{_otherwise(solution)}",
+        )
     more = np.sqrt(made.bend_chi2 / made.bend_dof)
     return Check("reference", state_of(made.p), made.bend, None, f"{found} ({more:.2g} times the errors of both)",
                  f"its positions have a distortion of their own: leave it out{_otherwise(solution)}")  # fmt: skip
