@@ -221,7 +221,7 @@ def test_the_degree_that_is_named_cures(degree):
     assert "agree with the exposures" in cured.sentence
 
 
-@pytest.mark.parametrize("options", [{}, {"layout": "fit"}])
+@pytest.mark.parametrize("options", [{"static": "hold"}, {"static": "hold", "layout": "fit"}])
 def test_detectors_that_are_distorted_are_to_be_fitted(options):
     """Nothing was given of their distortions that could be left out; with these fitted the reference agrees."""
     matches, rng = four_detectors.matches("static", 2, n=6, n_stars=160), np.random.default_rng(2)
@@ -231,10 +231,13 @@ def test_detectors_that_are_distorted_are_to_be_fitted(options):
                    "y_err": np.full(60, 0.05)})  # fmt: skip
     with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
         check = check_of(ld.solve(matches, degree=2, reference=known, **options))
+        plain = {each.name: each for each in ld.solve(matches, degree=2, reference=known).checks}
         cured = check_of(ld.solve(matches, degree=2, reference=known, layout="fit", static="fit"))
     assert check.state == "fail"
     assert "else --static fit, which finds the distortions of single detectors" in check.cure
     assert "given" not in check.cure
+    assert plain["reference"].cure.startswith("see chi2 and degree first")
+    assert plain["chi2"].cure == plain["camera"].cure == "--static fit"
     assert cured.state in ("unknown", "pass")
 
 
