@@ -55,8 +55,9 @@ def with_further(solution, matches):
     before.remove_columns(_ADDED)
     before, after = solution.camera.on_detectors(before), matches.camera.on_detectors(matches.table.copy())
     _check_new(Observations.of(before), Observations.of(after))
-    mean = _mean_distortions(solution, matches)
-    names, joins, poses = _on_its_plane(solution, matches, mean)
+    seen = Observations.of(solution.residuals)
+    mean = _mean_distortions(solution, seen, matches)
+    names, joins, poses = _on_its_plane(solution, seen, matches, mean)
     star = matches.observations.star
     after, names = after[joins[star]], names[star][joins[star]]
     after["star"] = np.array(names.tolist())
@@ -104,9 +105,9 @@ def _check_new(before, after):
             )
 
 
-def _on_its_plane(solution, matches, mean):
+def _on_its_plane(solution, seen, matches, mean):
     """How the solution calls stars of matches (n_stars,), whether they join (n_stars,), and poses from its plane."""
-    seen, own = Observations.of(solution.residuals), matches.observations
+    own, q = matches.observations, _undistorted(matches, mean)
     of_field = np.zeros(len(seen.stars), dtype=int)
     of_field[seen.star] = seen.fields[seen.exposure]
     known, given = (
@@ -130,50 +131,57 @@ def _on_its_plane(solution, matches, mean):
                 "found in it",
                 AssumptionWarning,
             )
-    poses |= _refined(matches, mean, solution.estimate.positions[found], found >= 0)
-    same = (found := _more(solution, matches, mean, poses, found, located)) >= 0
+    poses |= _refined(own, q, solution.estimate.positions[found], found >= 0)
+    same = (found := _more(solution, own, q, poses, found, located)) >= 0
     names = own.stars.astype(object)
     names[same] = seen.stars[found[same]]
     names[joins & ~same] = _fresh(seen.stars, own.stars[joins & ~same])
     return names, joins | same, poses
 
 
-def _mean_distortions(solution, matches):
+def _mean_distortions(solution, seen, matches):
     """For every further exposure the mean of what its detector has in the solution, ``{name: (2, n_modes)}``."""
-    before, out = _detectors(Observations.of(solution.residuals)), {}
+    before, out = _detectors(seen), {}
     for name, detector in _detectors(matches.observations).items():
         alike = [k for k, other in enumerate(solution.names) if before[other] == detector]
         out[name] = solution.coefficients[alike or slice(None)].mean(axis=0)
     return out
 
 
-def _refined(matches, mean, positions, known):
+def _undistorted(matches, mean):
+    """What was measured (n, 2) with mean distortions taken off."""
+    seen, out = matches.observations, np.empty_like(matches.observations.xy)
+    for i, name in enumerate(seen.names):
+        rows = seen.exposure == i
+        out[rows] = Distortion(mean[name], matches.shapes[name]).invert(seen.xy[rows])
+    return out
+
+
+def _refined(seen, q, positions, known):
     """Poses of exposures by positions (n_stars, 2) on the plane of those of their stars that are known there.
 
-    With mean distortions taken off, so that these decide where the plane is.
+    For undistorted positions q (n, 2), so that mean distortions do not decide where the plane is.
     """
-    poses, seen = {}, matches.observations
+    poses = {}
     for i, name in enumerate(seen.names):
         rows = np.flatnonzero((seen.exposure == i) & known[seen.star])
         if len(rows) >= _FEWEST:
-            xy = Distortion(mean[name], matches.shapes[name]).invert(seen.xy[rows])
-            poses[name] = robust_similarity(positions[seen.star[rows]], xy)
+            poses[name] = robust_similarity(positions[seen.star[rows]], q[rows])
     return poses
 
 
-def _more(solution, matches, mean, poses, found, located):
+def _more(solution, seen, q, poses, found, located):
     """Rows of the solution (n_stars,) that stars are, with those that rough positions did not tell; -1 for none.
 
     Of stars that are `located` (n_stars,) on its plane, by others of the same field.
     """
-    seen, known, first = matches.observations, solution.estimate.positions, found >= 0
+    known, first = solution.estimate.positions, found >= 0
     if not first.any():
         return found
-    places = np.empty_like(seen.xy)
+    places = np.empty_like(q)
     for i, name in enumerate(seen.names):
         rows = seen.exposure == i
-        undistorted = Distortion(mean[name], matches.shapes[name]).invert(seen.xy[rows])
-        places[rows] = apply(invert(poses[name]), undistorted)
+        places[rows] = apply(invert(poses[name]), q[rows])
     places = star_means(places, seen.star, len(seen.stars))
     limit = _FAR * np.median(np.hypot(*(places - known[found])[first].T))
     solved, own = np.flatnonzero(np.isfinite(known).all(axis=1)), cKDTree(places)

@@ -43,16 +43,15 @@ def one_more(static, rng):
     late = names == names[-1]
     known = {"shape": (SIZE, SIZE)}
     matches = ld.Matches.from_table(table[~late], **known)
-    seconds = []
+    new = ld.Matches.from_table(table[late], **known)
     for _ in range(2):  # loops are compiled the first time
         begun = time.perf_counter()
         base = ld.solve(matches)
-        seconds.append(time.perf_counter() - begun)
-    new = ld.Matches.from_table(table[late], **known)
-    begun = time.perf_counter()
-    more = ld.solve(new, base=base)
-    print(f"{len(base.names)} lists of one field, {np.sum(~late)} positions, solved in {seconds[-1]:.2f} s")
-    print(f"one more ({len(more.names)}) in {time.perf_counter() - begun:.2f} s")
+        solved = time.perf_counter()
+        more = ld.solve(new, base=base)
+        done = time.perf_counter()
+    print(f"{len(base.names)} lists of one field, {np.sum(~late)} positions, solved in {solved - begun:.2f} s")
+    print(f"one more ({len(more.names)}) in {done - solved:.2f} s")
 
 
 def main():
