@@ -57,7 +57,7 @@ def solve_shifts(matches, *, prior=None, weighted=False):
     """
     matches = replace(_checked(matches), poses=_without_own_turns(matches))
     prior = means(prior)
-    stated = replace(build_problem(matches, 0, prior=prior), prior_sigma=None, static_sigma=None)
+    stated = replace(build_problem(matches, 0, prior=prior), prior_sigma=None, static_covariance=None)
     problem = stated if weighted else _equal(stated)
     state = State(matches.positions.T.copy(), problem.prior_mean.copy(), _stacked(matches))
     result = minimisers.solve_joint(problem, state)

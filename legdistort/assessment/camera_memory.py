@@ -16,6 +16,7 @@ from astropy.table import QTable
 from ..cameras import storage as camera_files
 from ..cameras.camera import Camera
 from ..cameras.detector import Detector
+from ..cameras.stated_errors import FREE, UNKNOWN
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry import basis, detector_modes, epochs
 from ..inputs.table_files import records
@@ -31,7 +32,7 @@ from ..runtime.parallel import map_items
 from ..runtime.trees import codec
 from ..runtime.trees.facts import SIZE, array, number
 from .combined_nights import Chain, contradiction, fitted, own_scatter2
-from .known_maps import MEAN_SQUARE, chance
+from .known_maps import DETERMINED, MEAN_SQUARE, chance
 from .night_data import EXACT, Night, check_nights, dates_of, night_of
 
 if TYPE_CHECKING:
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
 LAYOUT, ROOT = 1, "legdistort_nights"
 #: Chance below which one of all nights is odd.
 ALARM = 0.003
-_UNKNOWN = 100.0  # error of a coefficient [pix] from which on nothing is known of it
 _WEAK = 10  # errors of a combination in those of most, from which it is told apart
 
 
@@ -121,9 +121,26 @@ class CombinedNights(ShownAsPrinted):
         """Which are several nights together, and speak of S itself."""
         return np.array([each.n_nights > 1 for each in self.nights])
 
+    def _known(self, date):
+        """S at a date (K,) and its covariance, free along what nights do not tell."""
+        mean, covariance = self._chain.at(self._year(date))
+        # what a map states counts however wide it is
+        whole = sum(each.information * (1 if each.n_stars else DETERMINED * UNKNOWN**2) for each in self.nights)
+        power, directions = np.linalg.eigh(whole)
+        told, free = directions[:, power > DETERMINED], directions[:, power <= DETERMINED]
+        if free.shape[1]:
+            across = told.T @ covariance @ free
+            gain = np.linalg.solve(free.T @ covariance @ free, across.T).T
+            mean = told @ (told.T @ mean - gain @ (free.T @ mean))
+            covariance = told @ (told.T @ covariance @ told - gain @ across.T) @ told.T + FREE**2 * free @ free.T
+        return mean, covariance
+
     @plain_numbers
     def static(self, date: float | Time | None = None, *, further_night: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """S at a date, normalised Legendre modes (2, n_modes), and its covariance (2 n_modes, 2 n_modes), pixels.
+
+        Combinations that nights together do not determine, to 0.3 px rms per axis over the detector, are zero in it,
+        with an error of 1000 px: what little they say of them rests on maps being polynomials exactly.
 
         Parameters
         ----------
@@ -132,7 +149,7 @@ class CombinedNights(ShownAsPrinted):
         further_night : bool
             Whether the covariance is that of a further night, with the scatter of nights.
         """
-        mean, covariance = self._chain.at(self._year(date))
+        mean, covariance = self._known(date)
         covariance = covariance + np.diag(self._widths**2) * further_night
         return (self._rows.T @ mean).reshape(2, -1), self._rows.T @ covariance @ self._rows
 
@@ -148,14 +165,9 @@ class CombinedNights(ShownAsPrinted):
             Whether it is for one exposure alone, which does not tell how far exposures scatter: as far as those of
             the nights, `exposure_scatter`, is the `sigma` of the prior then.
         """
-        mean, covariance = self._chain.at(self._year(date))
-        sigma = np.sqrt(np.diag(covariance) + self._widths**2)
-        known = sigma < _UNKNOWN
-        static = (self._rows.T @ np.where(known, mean, 0)).reshape(2, -1)
-        # every coefficient of a shear has the width of the shear: that is what a prior of widths states of it
-        widths = np.max(np.where(self._rows != 0, np.where(known, sigma, np.inf)[:, None], 0), axis=0).reshape(2, -1)
+        static, covariance = self.static(date, further_night=True)
         record = {"kind": "nights", "name": self.name, "nights": len(self.nights)}
-        known = Prior(static, static_sigma=widths, shape=self.shape, source=record)
+        known = Prior(static, static_covariance=covariance, shape=self.shape, source=record)
         if not (one_exposure and np.any(self.exposure_scatter)):
             return known
         degrees = np.maximum(np.add(*basis.orders(self.degree)), 1)  # a shift is a part of the pose
@@ -185,7 +197,7 @@ class CombinedNights(ShownAsPrinted):
         static, covariance = self.static(date)
         error = np.sqrt(np.diag(covariance)).reshape(2, -1)
         scatter = np.sqrt(self._widths**2 @ self._rows**2).reshape(2, -1)
-        known = np.where(error < _UNKNOWN, error, np.nan)
+        known = np.where(error < UNKNOWN, error, np.nan)
         return mode_table(coefficient=static, error=known, night_scatter=scatter)
 
     @cached_property
@@ -225,7 +237,7 @@ class CombinedNights(ShownAsPrinted):
         The error holds the scatter of nights; it is large where the night does not tell.
         """
         chain, scatter2 = self._chain, self._widths**2 * (self.nights[n].n_nights == 1)
-        whole = np.linalg.inv(chain.information[n] + np.eye(len(scatter2)) / _UNKNOWN**2)
+        whole = np.linalg.inv(chain.information[n] + np.eye(len(scatter2)) / UNKNOWN**2)
         covariance = self._rows.T @ (whole + np.diag(scatter2)) @ self._rows
         return (self._rows.T @ whole @ chain.pull[n]).reshape(2, -1), np.sqrt(np.diag(covariance)).reshape(2, -1)
 
@@ -307,14 +319,15 @@ class CombinedNights(ShownAsPrinted):
 
     def _said_of_weak(self):
         """Combinations whose errors are far larger than those of most, which single coefficients do not show."""
-        error = np.sqrt(np.linalg.eigvalsh(self._chain.at(self._year(None))[1]))
+        error = np.sqrt(np.linalg.eigvalsh(self._known(None)[1]))
         weak = error > _WEAK * np.median(error)
         if not weak.any():
             return []
         least, rest = np.min(error[weak]), np.sqrt(np.mean(error[~weak] ** 2))
+        known = "are not determined, which is" if least > UNKNOWN else f"are known to {least:.2g} px at best, and"
         return [
-            f"{np.count_nonzero(weak)} combinations are known to {least:.2g} px at best, and in the errors of all of "
-            f"their coefficients; the {np.count_nonzero(~weak)} others are known to {rest:.2g} px rms."
+            f"{np.count_nonzero(weak)} combinations {known} in the errors of all of their coefficients; the "
+            f"{np.count_nonzero(~weak)} others are known to {rest:.2g} px rms."
         ]
 
     def __str__(self) -> str:
@@ -393,7 +406,7 @@ def combine_nights(
     >>> seen = ld.simulate_matches(degree=2, n_exposures=6, rotations=[0, 90] * 3, dither=300.0, sigma=0.02)
     >>> camera = ld.combine_nights([ld.solve(seen.matches, degree=2)])
     >>> camera.prior()
-    <Prior: degree 2, 6 modes an axis, static_sigma given>
+    <Prior: degree 2, 6 modes an axis, static_sigma given, with correlations>
     """
     given = [results] if isinstance(results, (str, Path, Solution, CombinedNights, Prior)) else list(results)
     if not given:

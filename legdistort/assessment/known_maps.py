@@ -88,19 +88,23 @@ def known_map(thing, label, other=None):
         return _of_camera(thing, label, other and other.common)
     if not isinstance(thing, Prior):
         return _of_nights(thing, label)
-    widths = thing.static_sigma
-    covariance = None if widths is None else np.diag(np.minimum(widths.ravel(), _NOTHING) ** 2)
+    covariance = _stated(thing)
     named = thing.source.get("detector") if isinstance(thing.source, dict) else None
     key = named or "1"
     return KnownMap(label, {key: thing.mean}, {key: thing.shape}, covariance, is_named=named is not None)
 
 
+def _stated(thing):
+    """Covariance of the coefficients of a prior, or of a detector that is no part of a focal plane; None without."""
+    if thing.static_covariance is not None:
+        return np.where(np.isinf(thing.static_covariance), _NOTHING**2, thing.static_covariance)
+    widths = thing.static_sigma
+    return None if widths is None else np.diag(np.minimum(widths.ravel(), _NOTHING) ** 2)
+
+
 def _of_nights(nights, label):
-    """What a further night has, with all covariances; nothing where nights do not tell it."""
+    """What a further night has, with all covariances."""
     static, covariance = nights.static(further_night=True)
-    power, directions = np.linalg.eigh(covariance)
-    told = directions[:, power < 1 / DETERMINED]
-    static = (told @ (told.T @ static.ravel())).reshape(static.shape)
     return KnownMap(nights.name if label.startswith("the ") else label, {"1": static}, {"1": nights.shape}, covariance)
 
 
@@ -116,7 +120,10 @@ def _of_camera(camera, label, common=None):
         statics = {key: _whole(camera, each, common[:, :n]) for key, each in camera.detectors.items()}
     shapes = {key: each.shape for key, each in camera.detectors.items()}
     widths, covariance = [each.static_sigma for each in camera.detectors.values()], None
-    if any(each is not None for each in widths):
+    if not camera.has_focal_plane:
+        (detector,) = camera.detectors.values()
+        covariance = _stated(detector)
+    elif any(each is not None for each in widths):
         widths = [widths_alone(each, statics[key].shape[1]) for key, each in camera.detectors.items()]
         covariance = np.diag(np.concatenate([np.minimum(each.ravel(), _NOTHING) ** 2 for each in widths]))
         if n:

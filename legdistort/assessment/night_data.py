@@ -7,6 +7,7 @@ from dataclasses import KW_ONLY, dataclass, field
 import numpy as np
 from astropy import units as u
 
+from ..cameras.stated_errors import StaticErrors
 from ..exceptions import InputError
 from ..geometry import basis, detector_modes
 from ..inputs import column_contract
@@ -85,7 +86,10 @@ class Night:
 
     @classmethod
     def of_map(cls, prior: Prior, name: str) -> Night:
-        """That of a map, known to its `static_sigma`, or else to 0.001 px a coefficient; it counts as one exposure."""
+        """That of a map, known to its `static_sigma` or its covariance, or else to 0.001 px a coefficient.
+
+        It counts as one exposure.
+        """
         if not prior.states_mean or prior.degree == 0:
             raise InputError(f"{name} states no distortion: leave it out")
         if prior.shape is None:
@@ -93,11 +97,12 @@ class Night:
         if prior.table is not None:
             raise InputError(f"{name} has a table beside its series, which cannot be combined: make it of headers")
         degree, rows = prior.degree, detector_modes.dynamic_basis(prior.shape, prior.mean.shape[1])
-        variances = detector_modes.row_variances(rows, prior.static_widths(degree).ravel())
+        spread = StaticErrors.of([prior], degree).spread(rows[None], [0])
+        directions, variances = spread.directions[0], spread.variance[0]
+        information = directions / (variances + EXACT**2) @ directions.T
         return cls(
             name, date=None, n_exposures=1, n_stars=0, around=pointed(prior.mean, prior.shape), n_nights=1,
-            information=np.diag(1 / (variances + EXACT**2)), pull=np.zeros(len(rows)), scatter=np.zeros(degree),
-            nightly=None, dof=np.inf,
+            information=information, pull=np.zeros(len(rows)), scatter=np.zeros(degree), nightly=None, dof=np.inf,
         )  # fmt: skip
 
 

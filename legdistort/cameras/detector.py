@@ -15,25 +15,13 @@ from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees.facts import SIZE, array
 from .source import check_shape
+from .stated_errors import as_errors, as_widths
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 #: Points along an edge of its outline.
 _EDGE = 32
-
-
-def _widths(value, n, name):
-    """Standard deviations given as a number, per mode or per axis and mode, as (2, n); None as None."""
-    if value is None:
-        return None
-    try:
-        out = np.broadcast_to(np.asarray(value, dtype=float), (2, n)).copy()
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be a number, one per mode ({n},) or (2, {n}), got {value!r}") from None
-    if not np.all(out >= 0):
-        raise InputError(f"{name} must not be negative or NaN (standard deviations in pixels), got {value!r}")
-    return out
 
 
 @dataclass(frozen=True)
@@ -79,6 +67,9 @@ class Detector(ShownAsPrinted):
     static_sigma : array_like, optional
         That of `static`, the same forms; that of the Prior if one is given. None takes it as exact; of plain images
         (`Camera.has_focal_plane`) it is not known at all without `static`.
+    static_covariance : array_like, shape (2 n_modes, 2 n_modes), optional
+        Covariance of `static`, modes of x first, px^2, in the place of `static_sigma`, which its diagonal becomes; that
+        of the Prior if one is given. What solves detectors of a focal plane takes their modes as independent.
     layout_covariance : array_like, shape (6, 6), optional
         Covariance of the modes of `layout_sigma`, those of x first, instead of it, px^2. It is for the errors of
         `place`: as a prior they count as independent.
@@ -112,6 +103,9 @@ class Detector(ShownAsPrinted):
     static_sigma: np.ndarray | None = field(
         default=None, metadata=array(2, "modes", unit="pix", minimum=0, infinite=True)
     )
+    static_covariance: np.ndarray | None = field(
+        default=None, metadata=array("2 modes", "2 modes", unit="pix2", covariance=True, infinite=True)
+    )
     layout_covariance: np.ndarray | None = field(
         default=None, metadata=array(6, 6, unit="pix2", covariance=True, infinite=True)
     )
@@ -120,11 +114,13 @@ class Detector(ShownAsPrinted):
     def __post_init__(self) -> None:
         shape = check_shape(self.shape)
         layout = _affine(self.layout, "layout")
-        static, sigma = self.static, self.static_sigma
+        static, sigma, correlated = self.static, self.static_sigma, self.static_covariance
         if hasattr(static, "static_sigma"):
             if static.shape not in (None, shape):
                 raise InputError(f"the prior is for a detector of shape {static.shape}, this one has {shape} (ny, nx)")
-            static, sigma = static.mean, static.static_sigma if sigma is None else sigma
+            if sigma is None and correlated is None:
+                sigma, correlated = static.static_sigma, static.static_covariance
+            static = static.mean
         static = np.zeros((2, 1)) if static is None else Distortion(static, shape).coefficients
         if not np.array_equal(layout, np.eye(2, 3)):
             static, layout = _split(static, shape, layout)
@@ -132,8 +128,9 @@ class Detector(ShownAsPrinted):
         given["header_layout"] = None if self.header_layout is None else _affine(self.header_layout, "header_layout")
         covariance = _covariance(self.layout_covariance)
         widths = self.layout_sigma if covariance is None else np.sqrt(np.diag(covariance)).reshape(2, 3)
-        given["layout_sigma"], given["layout_covariance"] = _widths(widths, 3, "layout_sigma"), covariance
-        given["static_sigma"] = _widths(sigma, static.shape[1], "static_sigma")
+        given["layout_sigma"], given["layout_covariance"] = as_widths(widths, 3, "layout_sigma"), covariance
+        names = "static_sigma", "static_covariance"
+        given |= dict(zip(names, as_errors(sigma, correlated, static.shape[1], names), strict=True))
         for key, value in given.items():
             object.__setattr__(self, key, value)
 

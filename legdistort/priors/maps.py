@@ -39,9 +39,10 @@ def map_paths(path):
 def write_maps(prior, path, *, solution=None, overwrite=False):
     """Write the static distortion of a prior as two maps and, where it has errors, two of these.
 
-    The errors are those by its `static_sigma`, every coefficient by itself. Without any, those of the solution that it
-    was made of, given or in the file that it states: the mean over exposures of the variance of their maps, terms that
-    are a part of these and what is known of the common map counted in, a shift, rotation and scale left out.
+    The errors are those by its `static_covariance`, or by its `static_sigma`, every coefficient by itself. Without any,
+    those of the solution that it was made of, given or in the file that it states: the mean over exposures of the
+    variance of their maps, terms that are a part of these and what is known of the common map counted in, a shift,
+    rotation and scale left out.
 
     Parameters
     ----------
@@ -118,6 +119,9 @@ def _errors(prior, solution, distortion, path):
         values = basis.values(prior.degree, *basis.normalize(q, prior.shape))
         with np.errstate(invalid="ignore"):
             variance = prior.static_sigma**2 @ values**2
+        if (covariance := prior.static_covariance) is not None:
+            blocks = covariance.reshape(2, len(values), 2, -1)
+            variance = np.stack([np.einsum("mp,mn,np->p", values, blocks[k, :, k], values) for k in range(2)])
     else:
         pieces = [_of_solution(solution, q[first : first + _TOGETHER]) for first in range(0, len(q), _TOGETHER)]
         variance = np.concatenate(pieces, axis=1)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..cameras.source import check_shape
+from ..cameras.stated_errors import as_errors, as_widths, resized
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import basis
 from ..geometry.distortion import TABLE_TOLERANCE
@@ -35,28 +36,6 @@ HEADER = "header"
 #: Source of a mean whose source is not stated.
 UNSTATED = "unstated"
 _WIDTHS = array(2, "n_modes", unit="pix", minimum=0, infinite=True, choices=(EVIDENCE,))
-
-
-def _per_mode(value, n, name):
-    """A width given as a number, per mode or per axis and mode -> (2, n_modes), non-negative; None as None."""
-    if value is None or (isinstance(value, str) and name == "sigma" and value == EVIDENCE):
-        return value
-    if isinstance(value, str):
-        words = "widths in pixels" + (f", or {EVIDENCE!r}: found from the exposures" if name == "sigma" else "")
-        raise InputError(f"{name} must be {words}, got {value!r}")
-    try:
-        out = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be numbers, widths in pixels, got {value!r}") from None
-    try:
-        out = np.broadcast_to(out, (2, n)).copy()
-    except ValueError:
-        raise InputError(
-            f"{name} must be a number, one per mode ({n},) or per axis and mode (2, {n}), got shape {out.shape}"
-        ) from None
-    if not np.all(out >= 0):
-        raise InputError(f"{name} must be 0 or more (a standard deviation in pixels), got {value!r}")
-    return out
 
 
 def _declared(sigma, static_sigma):
@@ -96,6 +75,11 @@ class Prior(ShownAsPrinted):
         of the degree d that is fitted is about that large, in pixels, either sign. This makes
         ``s sqrt(((d + 1) (d + 2) - 4) / 8)`` px of distortion, rms per axis over the detector, shift, rotation and
         scale aside: s at degree 2, 1.4 s at 3, 1.8 s at 4, 2.2 s at 5; the scatter of exposures is then found.
+    static_covariance : array_like, shape (2 n_modes, 2 n_modes), optional
+        The covariance of the mean, those of x first, px^2, in the place of `static_sigma`, which its diagonal becomes:
+        what several coefficients have in common, such as maps that dithers without a roll do not tell, then leaves
+        the others as well known as they are. An infinite variance, or a combination with an error of 100 px and more,
+        is one of which nothing is known.
     shape : tuple, optional
         ``(ny, nx)`` of the detector it belongs to; solving exposures of another shape with it is then an error.
     source : str or dict, optional
@@ -117,7 +101,8 @@ class Prior(ShownAsPrinted):
     Raises
     ------
     InputError
-        For arrays of the wrong length or values that are not finite, and a table that is none, or without a mean.
+        For arrays of the wrong length or values that are not finite, what is no covariance, both of `static_sigma` and
+        `static_covariance` where they differ, and a table that is none, or without a mean.
 
     See Also
     --------
@@ -140,6 +125,10 @@ class Prior(ShownAsPrinted):
     _: KW_ONLY
     sigma: np.ndarray | str | None = field(default=None, metadata=_WIDTHS)
     static_sigma: np.ndarray | float | None = field(default=None, metadata=_WIDTHS)
+    static_covariance: np.ndarray | None = field(
+        default=None,
+        metadata=array("2 n_modes", "2 n_modes", unit="pix2", covariance=True, infinite=True),
+    )
     shape: tuple[int, int] | None = field(default=None, metadata=SIZE)
     truncation: float = field(default=0.0, metadata=number(entry="truncation_px", minimum=0, unit="pix"))
     plane: np.ndarray | None = field(default=None, metadata=array(2, 3, unit="pix", invertible=True))
@@ -154,6 +143,8 @@ class Prior(ShownAsPrinted):
             object.__setattr__(self, "mean", np.zeros((2, 1)))
             object.__setattr__(self, "source", UNSTATED)
         if self.mean is None:
+            if self.static_covariance is not None:
+                raise InputError("static_covariance is that of a mean: give the mean as well")
             object.__setattr__(self, "static_sigma", _declared(self.sigma, self.static_sigma))
             object.__setattr__(self, "sigma", None)  # which is found
             return
@@ -167,8 +158,15 @@ class Prior(ShownAsPrinted):
             raise InputError("mean has values that are not finite")
         basis.degree_of(mean.shape[1])
         object.__setattr__(self, "mean", mean)
-        for name in ("sigma", "static_sigma"):
-            object.__setattr__(self, name, _per_mode(getattr(self, name), mean.shape[1], name))
+        if isinstance(self.sigma, str) and not is_sought:
+            words = f"widths in pixels, or {EVIDENCE!r}: found from the exposures"
+            raise InputError(f"sigma must be {words}, got {self.sigma!r}")
+        names = "static_sigma", "static_covariance"
+        errors = as_errors(self.static_sigma, self.static_covariance, mean.shape[1], names)
+        given = dict(zip(names, errors, strict=True))
+        given |= {} if is_sought else {"sigma": as_widths(self.sigma, mean.shape[1], "sigma")}
+        for name, value in given.items():
+            object.__setattr__(self, name, value)
 
     @property
     def degree(self) -> int:
@@ -191,6 +189,14 @@ class Prior(ShownAsPrinted):
         if self.source == UNSTATED:
             return np.full((2, basis.n_modes(degree)), np.inf)
         return basis.change_degree(np.zeros((2, 1)) if self.static_sigma is None else self.static_sigma, degree)
+
+    @plain_numbers
+    def static_covariance_to(self, degree: int) -> np.ndarray | None:
+        """`static_covariance` to a total degree, (2 n_modes, 2 n_modes), px^2; None where there is none.
+
+        Zero beyond the degree of the mean, as the modes there are.
+        """
+        return resized(self.static_covariance, basis.n_modes(degree))
 
     def describe(self) -> dict[str, Any]:
         """Everything but the mean as plain numbers and strings, as files of solutions keep it."""
@@ -229,7 +235,8 @@ class Prior(ShownAsPrinted):
         if self.mean is None:
             return replace(self, sigma=sigma)
         static = None if self.static_sigma is None else basis.change_degree(self.static_sigma, degree)
-        return replace(self, mean=basis.change_degree(self.mean, degree), sigma=sigma, static_sigma=static)
+        known = {"static_sigma": static, "static_covariance": self.static_covariance_to(degree)}
+        return replace(self, mean=basis.change_degree(self.mean, degree), sigma=sigma, **known)
 
     def __repr__(self) -> str:
         if self.mean is None:
@@ -239,6 +246,7 @@ class Prior(ShownAsPrinted):
         words += [
             f"{name} {'by evidence' if isinstance(v, str) else 'given'}" for name, v in widths.items() if v is not None
         ]
+        words += ["with correlations"] if self.static_covariance is not None else []
         words += ["table beside"] if self.table is not None else []
         return f"<Prior: {', '.join(words)}>"
 

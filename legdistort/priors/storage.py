@@ -75,6 +75,8 @@ def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=No
         if given:
             named = ", ".join(f"{key} (--{key})" for key in given)
             raise InputError(f"{where} is a prior already: {named} cannot be chosen any more; leave it out")
+        if "static_sigma" in widths:
+            widths["static_covariance"] = None
         return dataclasses.replace(ready, **widths)
     files = where if isinstance(where, (list, tuple)) else [where]
     files = [path for path in files if isinstance(path, (str, Path))]
@@ -113,7 +115,8 @@ def _ready(where, kind, ext):
     if camera is not found:  # of a solution, the static distortion of the exposures of another field
         return of_solution(found, kind, {"name": str(where), "files": {Path(where).name: found.checksum}})
     (detector,) = camera.detectors.values()
-    return kind(detector.static, static_sigma=detector.static_sigma, shape=detector.shape, source=source)
+    errors = {"static_sigma": detector.static_sigma, "static_covariance": detector.static_covariance}
+    return kind(detector.static, **errors, shape=detector.shape, source=source)
 
 
 def _of_detector(camera, key, kind, source):
@@ -148,4 +151,5 @@ def of_solution(solution, kind, source):
     statics = found(solution).statics
     if len(statics) != 1:
         return kind(solution.coefficients.mean(axis=0), **known)
-    return kind(statics[0].mean, static_sigma=statics[0].sigma, **known)
+    errors = {"static_sigma": statics[0].sigma, "static_covariance": statics[0].covariance}
+    return kind(statics[0].mean, **errors, **known)

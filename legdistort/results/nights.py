@@ -50,11 +50,16 @@ class NightStatic:
         Of a night that comes: the error of the mean and the scatter of nights; infinite where it is not determined.
     n_nights : int
         From which it was found.
+    covariance : ndarray, shape (2 n_modes, 2 n_modes), or None
+        That of which `sigma` is the diagonal; None in files that have none.
     """
 
     mean: np.ndarray = field(metadata=array(2, "n_series", unit="pix"))
     sigma: np.ndarray = field(metadata=array(2, "n_series", unit="pix", minimum=0, infinite=True))
     n_nights: int = field(metadata=number(minimum=1))
+    covariance: np.ndarray | None = field(
+        default=None, metadata=array("2 n_series", "2 n_series", unit="pix2", covariance=True, infinite=True)
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -141,7 +141,7 @@ def alias(problem, state, gauge, covariance, *, independent, common):
     n_fit, n_exposures = problem.n_modes, problem.n_exposures
     degree = basis.degree_of(max(independent.shape[1], common.shape[1]))
     mean = basis.change_degree(problem.prior_mean, max(degree, basis.degree_of(problem.prior_mean.shape[2])))
-    full = replace(problem, degree=degree, prior_mean=mean, prior_sigma=None, static_sigma=None)
+    full = replace(problem, degree=degree, prior_mean=mean, prior_sigma=None, static_covariance=None)
     blocks = criterion.linearise(full, State(state.stars, mean, state.poses))
     normal = elimination.reduced_matrix(full, blocks)
     fitted = np.tile(np.arange(full.n_modes) < n_fit, 2 * n_exposures)

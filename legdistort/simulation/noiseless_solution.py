@@ -62,7 +62,7 @@ def noiseless_solution(matches, problem, layout, scatter):
         fit, errors = forecast(layout.terms, Fit(matches, problem, result, np.ones(n, dtype=bool), None))
         uncertainty = held = fit.uncertainty
     if gauge.static in ("none", "fitted", "uncertain"):
-        plain = _gauge(replace(problem, mean_sigma=None), state, blocks, scatter, layout.sigma)
+        plain = _gauge(replace(problem, static_errors=None), state, blocks, scatter, layout.sigma)
         held = Uncertainty(problem, blocks, plain, camera=uncertainty.camera)
     solution = assemble(
         matches,
@@ -92,7 +92,7 @@ def _gauge(problem, state, blocks, scatter, sigma):
     dynamic = np.stack([others.T @ (others * assumed**2 @ others.T) @ others] * problem.n_exposures)
     if scatter is not None:
         return constraints.make("minimal", problem, state, blocks, dynamic=dynamic)
-    gauge = constraints.make("minimal", replace(problem, mean_sigma=None), state, blocks, dynamic=dynamic)
+    gauge = constraints.make("minimal", replace(problem, static_errors=None), state, blocks, dynamic=dynamic)
     unknown = named(10 * gauge.plane_modes().others.T, gauge, state.positions.T)  # any size
     nothing = {"dynamic": np.zeros_like(dynamic), "covariance": np.zeros_like(gauge.covariance)}
     return replace(gauge, **nothing, unknown_maps=unknown, static="open")

@@ -84,7 +84,7 @@ def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, s
                 blocks=blocks,
                 uncertainty=uncertainty,
                 times=matches.times,
-                header_distortion=matches.header_distortion if np.all(np.isinf(problem.mean_sigma)) else None,
+                header_distortion=matches.header_distortion if problem.static_errors.knows_nothing else None,
             ),
         ),
     )

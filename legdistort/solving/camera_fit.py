@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..cameras.detector import affine_of
+from ..cameras.stated_errors import resized
 from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, LegdistortError, SolveError, warn
 from ..geometry import basis, similarity
 from ..results.errors.camera_errors import CameraErrors, Departure, moved_by, unit_errors
@@ -406,7 +407,7 @@ def held(matches, layout, static):
     if len(matches.names) == 1 and matches.camera.has_focal_plane:  # no star goes from one detector to another
         layout, static = layout or "hold", static or "hold"
     exact = {"layout_sigma": None, "layout_covariance": None} if layout == "hold" else {}
-    exact |= {"static_sigma": None} if static == "hold" else {}
+    exact |= {"static_sigma": None, "static_covariance": None} if static == "hold" else {}
     if not exact:
         return matches
     detectors = {key: replace(each, **exact) for key, each in matches.camera.detectors.items()}
@@ -544,13 +545,14 @@ def changed(camera, change):
         static = basis.change_degree(each.static, top) + basis.change_degree(change[k], top)
         static[:, :3] = 0.0  # the layout, which moves the static distortion along
         layout = similarity.compose(low, each.layout)
-        detectors[key] = replace(each, layout=layout, static=static, static_sigma=_widened(each, top))
+        detectors[key] = replace(each, layout=layout, static=static, **_widened(each, top))
     return replace(camera, detectors=detectors)
 
 
 def _widened(detector, degree):
-    """Uncertainty of the static distortion of a detector with the modes of a degree, which it may not have had."""
-    return None if detector.static_sigma is None else basis.change_degree(detector.static_sigma, degree)
+    """Uncertainties of the static distortion of a detector with the modes of a degree, which it may not have had."""
+    sigma = None if detector.static_sigma is None else basis.change_degree(detector.static_sigma, degree)
+    return {"static_sigma": sigma, "static_covariance": resized(detector.static_covariance, basis.n_modes(degree))}
 
 
 def with_errors(camera, step, unknown):
@@ -576,7 +578,8 @@ def with_errors(camera, step, unknown):
         top = max(basis.degree_of(free.shape[2]), basis.degree_of(each.static.shape[1]))
         widths = basis.change_degree(np.where(np.arange(free.shape[2]) < 3, 0.0, errors[k]), top)
         static = basis.change_degree(each.static, top)
-        detectors[key] = replace(each, layout_covariance=covariance, static=static, static_sigma=widths)
+        known = {"static_sigma": widths, "static_covariance": None}
+        detectors[key] = replace(each, layout_covariance=covariance, static=static, **known)
     return replace(camera, detectors=detectors)
 
 

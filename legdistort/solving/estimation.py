@@ -374,13 +374,15 @@ def _of_detector(camera, prior, model):
         raise InputError(
             f"camera {camera.name} has a static distortion of its own: leave prior and model out, or take that off"
         )
-    known = {"static_sigma": detector.static_sigma, "shape": detector.shape}
+    known = {"shape": detector.shape, "static_sigma": detector.static_sigma}
+    known |= {"static_covariance": detector.static_covariance}
     return Prior(detector.static, source=f"camera {camera.name}", **known)
 
 
 def _knows_nothing_of_a_mode(prior):
-    sigma = getattr(prior, "static_sigma", None)
-    return sigma is not None and not isinstance(sigma, str) and bool(np.isinf(sigma).any())
+    if prior is None or prior.static_sigma is None or prior.static_covariance is not None:
+        return False
+    return bool(np.isinf(prior.static_sigma).any())
 
 
 def _fitted(matches, options, sought, join):

@@ -137,7 +137,7 @@ class Fit:
         n_free = elimination.star_freedom(self.weighted, self.blocks) + self.effective_modes.sum()
         n_free += self.shared_unknowns + (0.0 if self.result.gauge.tie is None else self.result.gauge.tie.freedom)
         if problem.unknowns.shared:
-            priors = problem, replace(problem, static_sigma=None)
+            priors = problem, replace(problem, static_covariance=None)
             by_prior, by_widths = (effective_modes.done_by_prior(p, self.uncertainty).sum() for p in priors)
             n_free += problem.unknowns.n_common - self.result.n_weak - (by_prior - by_widths)
         return round(float(2 * np.count_nonzero(self.used) - n_free), 6)

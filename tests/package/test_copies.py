@@ -51,7 +51,7 @@ def detector(x, seed):
     factor = rng.normal(0, 0.1, (6, 6))
     return Detector(
         SHAPE, layout=np.array([[1.0, 0.01, -x], [-0.01, 1.0, -8.0]]), static=static,
-        static_sigma=np.full((2, 10), 0.03), layout_covariance=factor @ factor.T + 0.01 * np.eye(6),
+        static_covariance=1e-4 * (8 * np.eye(20) + 1), layout_covariance=factor @ factor.T + 0.01 * np.eye(6),
         header_layout=[[0.9, 0.1, 40.0], [-0.1, 0.9, -7.0]],
     )  # fmt: skip
 
@@ -85,7 +85,7 @@ def matches():
 def prior():
     record = {"kind": "FITS", "name": "b.fits", "files": {"b.fits": 32 * "1f"}}
     return Prior(
-        RNG.normal(0, 1, (2, 6)), sigma=RNG.uniform(0.1, 1, (2, 6)), static_sigma=RNG.uniform(0.1, 1, (2, 6)),
+        RNG.normal(0, 1, (2, 6)), sigma=RNG.uniform(0.1, 1, (2, 6)), static_covariance=np.eye(12) + 0.2,
         shape=SHAPE, truncation=0.25, plane=np.array([[2.0, 0.1, 3.0], [-0.1, 2.0, 4.0]]), source=record,
         table=DisplacementTable(RNG.normal(0, 0.1, (2, 3, 4)), (-5.0, -6.0), (20.0, 30.0)),
     )  # fmt: skip
@@ -232,9 +232,10 @@ CASES = {
         {"widths": {"sigma": "is what was asked for"}},
     ),
     "Prior without a mean": Case(
-        lambda: replace(prior(), mean=None, sigma=None, static_sigma=0.5, table=None),
+        lambda: replace(prior(), mean=None, sigma=None, static_sigma=0.5, static_covariance=None, table=None),
         {"file": prior_file, "widths": lambda given, path: given.with_sigma(None)},
-        unset={"sigma": "is the scatter around a mean", "table": "is beside a mean"},
+        unset={"sigma": "is the scatter around a mean", "table": "is beside a mean"}
+        | {"static_covariance": "is that of a mean"},
     ),
     "Exposure": Case(
         exposure,

@@ -34,8 +34,8 @@ def declared(sim):
 def test_size_is_that_of_every_coefficient_at_any_degree(sim):
     for degree in (0, 2, 5):
         problem = build_problem(sim.matches, degree, prior=ld.Prior(None, static_sigma=2.0))
-        assert_array_equal(problem.static_sigma, np.full((2, basis.n_modes(degree)), 2.0))
-        assert_array_equal(problem.mean_sigma, np.full((8, 2, basis.n_modes(degree)), 2.0))
+        assert_array_equal(problem.static_covariance, 4.0 * np.eye(2 * basis.n_modes(degree)))
+        assert_array_equal(problem.static_errors.sigma, np.full((8, 2, basis.n_modes(degree)), 2.0))
         assert not problem.prior_mean.any()
         assert problem.prior_mean.shape[2] == basis.n_modes(degree)
 

@@ -1,12 +1,17 @@
 """Static distortions from published models, and the similarities that are no part of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.modeling import models
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.special import eval_legendre
 
+import legdistort as ld
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis, similarity
 from legdistort.geometry.detector_modes import similarity_basis, similarity_part
@@ -234,3 +239,104 @@ def test_words_for_widths():
     for size in (0.0, -1.0, np.inf, np.nan, None, True, "x"):
         with pytest.raises(InputError, match="without a mean, static_sigma must be a positive number"):
             Prior(None, static_sigma=size)
+
+
+# --- a covariance in the place of widths --------------------------------------------------------------------------
+
+
+def some_covariance(seed=0, n=10, size=0.02):
+    factor = np.random.default_rng(seed).normal(size=(2 * n, 2 * n))
+    return size**2 * factor @ factor.T / (2 * n)
+
+
+def test_a_covariance_has_widths_and_is_kept(tmp_path):
+    covariance = some_covariance()
+    prior = Prior(np.zeros((2, 10)), static_covariance=covariance, shape=(50, 60))
+    assert_allclose(prior.static_sigma.ravel(), np.sqrt(np.diag(covariance)))
+    assert "with correlations" in repr(prior)
+    read = Prior.read(prior.write(tmp_path / "prior.asdf"))
+    assert_allclose(read.static_covariance, covariance, atol=1e-15)
+    assert read.with_sigma(0.1).static_covariance is not None
+    wider = replace(read, static_sigma=0.3, static_covariance=None)
+    assert wider.static_covariance is None
+    assert_array_equal(wider.static_sigma, np.full((2, 10), 0.3))
+    assert Prior.from_file(tmp_path / "prior.asdf", static_sigma=0.3).static_covariance is None
+    camera = ld.Camera("C", {"1": ld.Detector((50, 60), static=prior)})
+    again = ld.Camera.read(camera.write(tmp_path / "camera.asdf"))["1"]
+    assert_allclose(again.static_covariance, covariance, atol=1e-15)
+    assert_allclose(again.static_sigma, prior.static_sigma)
+
+
+def test_to_another_degree_it_is_cut_or_exact():
+    covariance = some_covariance()
+    prior = Prior(np.zeros((2, 10)), static_covariance=covariance)
+    low, high = prior.static_covariance_to(1), prior.static_covariance_to(4)
+    kept = [0, 1, 2, 10, 11, 12]
+    assert_allclose(low, covariance[np.ix_(kept, kept)], atol=1e-15)
+    assert_allclose(np.sqrt(np.diag(high)).reshape(2, -1), prior.static_widths(4))
+    assert Prior(np.zeros((2, 10)), static_sigma=1.0).static_covariance_to(2) is None
+
+
+def test_what_is_unknown_is_infinite():
+    covariance = some_covariance()
+    covariance[3] = covariance[:, 3] = np.nan
+    covariance[3, 3] = np.inf
+    prior = Prior(np.zeros((2, 10)), static_covariance=covariance)
+    assert np.isinf(prior.static_sigma[0, 3])
+    assert np.isfinite(prior.static_sigma).sum() == 19
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"static_covariance": np.eye(3)}, r"static_covariance must be a covariance of shape \(20, 20\)"),
+        ({"static_covariance": "large"}, "static_covariance must be numbers, a covariance in px"),
+        ({"static_covariance": -np.eye(20)}, "gives a combination a negative variance"),
+        ({"static_covariance": np.eye(20) + 2 * np.eye(20, k=1) + 2 * np.eye(20, k=-1)}, "negative variance"),
+        ({"static_covariance": np.eye(20) + np.eye(20, k=1)}, "is not symmetric"),
+        ({"static_covariance": np.full((20, 20), np.nan)}, "must be numbers, but for infinite variances"),
+        ({"static_covariance": np.eye(20), "static_sigma": 0.5}, "static_sigma and static_covariance differ"),
+    ],
+)
+def test_what_is_no_covariance_is_refused(words, message):
+    with pytest.raises(InputError, match=message):
+        Prior(np.zeros((2, 10)), **words)
+    if "static_sigma" not in words:
+        with pytest.raises(InputError, match=message):
+            ld.Detector((50, 60), static=np.zeros((2, 10)), **words)
+
+
+def test_without_a_mean_it_has_no_sense():
+    with pytest.raises(InputError, match="static_covariance is that of a mean: give the mean as well"):
+        Prior(None, static_covariance=np.eye(20))
+
+
+def test_its_errors_are_on_the_maps(tmp_path):
+    """Those of the series at a pixel, drawn by the covariance with numpy."""
+    covariance = some_covariance(3)
+    prior = Prior(np.zeros((2, 10)), static_covariance=covariance, shape=(40, 60))
+    prior.write(tmp_path / "map.fits")
+    found = [fits.getdata(tmp_path / f"map_{axis}_err.fits")[31, 7] for axis in "xy"]
+    u, v = (2 * 7 + 1) / 60 - 1, (2 * 31 + 1) / 40 - 1
+    legendre = [[eval_legendre(k, t) * np.sqrt(k + 0.5) for k in range(4)] for t in (u, v)]
+    values = np.array([legendre[0][d - k] * legendre[1][k] for d in range(4) for k in range(d + 1)])
+    drawn = np.random.default_rng(1).multivariate_normal(np.zeros(20), covariance, 40_000).reshape(-1, 2, 10)
+    assert_allclose(found, (drawn @ values).std(axis=0), rtol=0.02)
+
+
+def test_a_diagonal_one_is_the_widths():
+    """In a solution: the same positions and errors, absolute ones too."""
+    simulated = ld.simulate_matches(degree=2, n_exposures=5, n_stars=40, rotations=[0, 40, 0, 40, 0], seed=1)
+    mean, widths = simulated.truth.static, np.full((2, 6), 0.05)
+    widths[:, 4] = np.inf
+    by_widths = Prior(mean, static_sigma=widths)
+    by_covariance = Prior(mean, static_covariance=np.diag(widths.ravel() ** 2))
+    for words in ({}, {"static": "fit"}):
+        if words:
+            by_widths = replace(by_widths, static_sigma=np.full((2, 6), 0.05))
+            by_covariance = replace(by_widths, static_sigma=None, static_covariance=0.05**2 * np.eye(12))
+        one, two = (
+            ld.solve(simulated.matches, degree=2, prior=each, **words).stars for each in (by_widths, by_covariance)
+        )
+        for name in ("x", "y", "x_err", "x_err_abs"):
+            assert_allclose(one[name].value, two[name].value, rtol=1e-6, atol=1e-9)

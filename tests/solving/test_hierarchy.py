@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from legdistort.cameras.stated_errors import StaticSpread
 from legdistort.exceptions import SolveError
 from legdistort.geometry.detector_modes import dynamic_basis, dynamic_degrees
 from legdistort.geometry.plane_modes import PlaneModes
@@ -107,7 +108,11 @@ def test_scatter_is_that_of_exposures_of_less_than_ten_times_the_usual_variance(
         own[-1] = departure
         error = 1e-4 * np.where(np.arange(n) == n - 1, ratio, 1.0)[:, None, None] * np.eye(2 * modes)
         problem = SimpleNamespace(n_modes=modes, n_exposures=n, prior_mean=0.0, has_widths=lambda i: False)
-        state, maps, exact = SimpleNamespace(coefficients=own), np.zeros((n, 8, 0)), np.zeros((1, 8))
+        state, maps, exact = (
+            SimpleNamespace(coefficients=own),
+            np.zeros((n, 8, 0)),
+            StaticSpread.of_rows(np.zeros((1, 8))),
+        )
         return dynamic_scatter.dynamic_covariance(problem, state, error, maps, others, None, np.zeros(n, int), exact)[
             0
         ][0]

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from scipy import sparse, stats
 
 import legdistort as ld
+from legdistort.cameras.stated_errors import StaticSpread
 from legdistort.exceptions import LegdistortWarning, SolveError
 from legdistort.geometry import basis
 from legdistort.solving.knowledge.exposures import ExposureModel
@@ -130,15 +131,15 @@ def test_dense_model_reaches_the_errors_at_large_departures():
 class TestStatic:
     """The test of a prior."""
 
-    def of(self, data, given, sigma=0.0):
-        solution = solved(data, ld.Prior(given, static_sigma=sigma or None))
+    def of(self, data, given, sigma=0.0, covariance=None):
+        solution = solved(data, ld.Prior(given, static_sigma=sigma or None, static_covariance=covariance))
         other = dense_model.rows(3)[1]  # the same as the package has them, but for signs and order
         from legdistort.geometry.detector_modes import dynamic_basis
 
         mine = dynamic_basis((2048, 2048), 10)
         assert_allclose(mine.T @ mine, other.T @ other, atol=1e-12)
-        mean, variance = mine @ np.ravel(given), mine**2 @ np.full(20, sigma**2)
-        (test,) = static_tests(model_of(solution), mean[None], variance[None], [(2048, 2048)])
+        spread = StaticSpread.of(mine[None], np.full((1, 20), sigma), None if covariance is None else [covariance])
+        (test,) = static_tests(model_of(solution), (mine @ np.ravel(given))[None], spread, [(2048, 2048)])
         return test
 
     def test_agrees_with_the_dense_model(self):
@@ -159,6 +160,21 @@ class TestStatic:
         assert test.p > 0.01
         assert test.power(1e-3) > 0.95
         assert self.of(data, -truth["static"], sigma).p < (1e-10 if not sigma else 1e-3)
+
+    def test_it_is_blind_along_what_is_not_known(self):
+        """However wrong the mean is along a combination of unknown size, and nowhere else."""
+        data, truth = dense_model.drawn_set(5, rolls=30.0)
+        along = np.zeros((2, 10))
+        along[:, [3, 5, 7]] = RNG.normal(size=(2, 3))
+        across = np.roll(along, 1, axis=0) * [[1], [-1]]
+        covariance = 0.01**2 * np.eye(20) + 500.0**2 * np.outer(along, along)
+        right, wrong, off = (
+            self.of(data, truth["static"] + each, covariance=covariance) for each in (0, 0.15 * along, 1.5 * across)
+        )
+        assert len(right.directions) == 15
+        assert wrong.statistic() == pytest.approx(right.statistic(), rel=0.03)
+        assert right.p > 0.01
+        assert off.p < 1e-6
 
     def test_p_is_evenly_spread_for_right_priors(self):
         sets = (dense_model.drawn_set(seed, n_stars=70) for seed in range(30))
@@ -194,7 +210,7 @@ class TestStatic:
     def test_power_is_the_share_that_is_found(self):
         """Of drawn differences, for a test of any information."""
         information, given = np.diag([4.0, 1.0, 0.25]), np.array([2.0, 1.0, 1.0])
-        test = StaticTest(information, np.zeros(3), given, np.zeros(3), (8, 8), np.eye(3), 1e6)
+        test = StaticTest(information, np.zeros(3), given, np.zeros((3, 3)), (8, 8), np.eye(3), 1e6)
         drawn = given + RNG.normal(size=(20_000, 3)) / np.sqrt(np.diag(information))
         t = np.einsum("na,ab,nb->n", drawn, information, drawn)
         assert test.power(0.05) == pytest.approx(np.mean(t > stats.chi2.isf(0.025, 3)), abs=0.03)

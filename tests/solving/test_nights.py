@@ -15,6 +15,7 @@ from numpy.polynomial.legendre import legval2d
 from numpy.testing import assert_allclose, assert_array_equal
 
 import legdistort as ld
+from legdistort.cameras.stated_errors import StaticSpread
 from legdistort.exceptions import InputError
 from legdistort.geometry import epochs
 from legdistort.solving.gauge import hierarchy
@@ -84,7 +85,9 @@ def test_nights_are_a_covariance_of_departures():
     night, group = np.array([0, 0, 1, 1, 1, 2, 2]), np.array([0, 0, 0, 0, 0, 1, 1])
     spread = rng.normal(size=(n, k, k))
     spread = spread @ spread.mT + np.eye(k)
-    nightly, static = rng.uniform(0.5, 2, (3, k)), rng.uniform(0.5, 2, (2, k))
+    nightly, factors = rng.uniform(0.5, 2, (3, k)), rng.normal(size=(2, k, k))
+    covariances = factors @ factors.mT
+    static = StaticSpread.of(np.broadcast_to(np.eye(k), (2, k, k)), np.ones((2, k)), covariances)
     motion = rng.normal(size=(n, k, k))
     nothing = np.zeros((n, k, 0))
     made = hierarchy.Hierarchy(motion, np.broadcast_to(np.eye(k), (n, k, k)), spread, np.linalg.inv(spread), night,
@@ -94,7 +97,7 @@ def test_nights_are_a_covariance_of_departures():
         dense[i, :, i] = spread[i]
         for j in range(n):
             dense[i, :, j] += np.diag(nightly[night[i]]) * (night[i] == night[j])
-            dense[i, :, j] += np.diag(static[group[i]]) * (group[i] == group[j])
+            dense[i, :, j] += covariances[group[i]] * (group[i] == group[j])
     expected = motion.reshape(n * k, k).T @ np.linalg.inv(dense.reshape(n * k, n * k))
     assert_allclose(made.rows(static).reshape(k, -1), expected, atol=1e-12)
 

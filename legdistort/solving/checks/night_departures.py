@@ -13,8 +13,9 @@ from functools import cache
 import numpy as np
 from scipy import sparse, special
 
+from ...cameras.stated_errors import FREE, as_errors, resized
 from ...geometry import basis
-from ...geometry.detector_modes import dynamic_basis, dynamic_degrees, row_variances
+from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...results.check import FALSE_ALARM
 from ...results.nights import NightsFound, NightStatic, NightTest
 from ..knowledge.exposures import RANGE, ExposureModel
@@ -37,7 +38,7 @@ _FREE = 100.0  # size of what is free [pix]
 _RANGE = 0.1, 1e6
 _MAP = 2.0  # size of a common map, in that of the coefficients: the plane is none that would need larger ones
 _SMALLEST = 1e-5  # pixels: as good as exact
-_KNOWN = 0.3 * np.sqrt(8)  # error of a coefficient beyond which a direction is not determined [pix]
+_KNOWN = 0.3 * np.sqrt(8)  # error of a combination beyond which a direction is not determined [pix]
 
 
 def found_nights(solution, problem, state, blocks):
@@ -123,24 +124,25 @@ def _static(solution, problem, state, each):
     if len(np.unique(problem.night)) < FEWEST:
         return None
     n, rows = problem.n_modes, dynamic_basis(problem.shapes[0], problem.n_modes)
-    stated = np.zeros((2, n)) if problem.mean_sigma is None else problem.mean_sigma[0][:, :n]
-    stated = np.clip(np.sqrt(row_variances(rows, stated.ravel())), _SMALLEST, _FREE)
+    stated = problem.errors_of_statics.to_modes(n).spread(rows[None], [0])
+    width = np.clip(np.sqrt(stated.variance), _SMALLEST, _FREE)
     model = ExposureModel.of(problem, state, solution.gauge.all_motion[keep], np.zeros(len(keep), dtype=int))
     unit = 1 / np.sqrt(np.median(np.diag(model.data.curvature)))
-    factor = Factor.joined([model.departures, model.statics(width=stated)])
+    factor = Factor.joined([model.departures, model.statics(width=width, directions=stated.directions)])
     found = most_likely(model.data, factor, np.full(model.n_scatters, 10 * unit), unit * np.array(RANGE))
     mine, covariance = slice(-len(rows), None), found.covariance[-len(rows) :, -len(rows) :]
     scatter = problem.night_sigma
     if scatter is None:  # where every night has one exposure, that of exposures
         scatter = found.sizes[model.degrees - 1 + (model.degrees.max() if model.n_nights else 0)]
-    # widths have no correlations: a diagonal matrix of such sums is no smaller than the covariance in any direction
-    variance = np.abs(covariance).sum(axis=1) + scatter**2
-    variance[np.diag(covariance) > _KNOWN**2] = np.inf
+    power, directions = np.linalg.eigh(covariance)
+    told = power < _KNOWN**2
+    covariance = directions * np.where(told, power, FREE**2) @ directions.T + np.diag(scatter**2)
+    covariance = rows.T @ covariance @ rows
     out = problem.prior_mean[0].copy()
-    out[:, :n] += (rows.T @ found.mean[mine]).reshape(2, n)
-    sigma = np.zeros(out.shape)
-    sigma[:, :n] = np.sqrt([variance[of].sum() for of in (rows != 0).T]).reshape(2, n)  # each is in one row, or in none
-    return NightStatic(out, sigma, len(np.unique(problem.night)))
+    step = directions[:, told] @ (directions[:, told].T @ found.mean[mine])
+    out[:, :n] += (rows.T @ step).reshape(2, n)
+    sigma, covariance = as_errors(None, resized(covariance, out.shape[1]), out.shape[1], ("sigma", "covariance"))
+    return NightStatic(out, sigma, len(np.unique(problem.night)), covariance)
 
 
 def _together(tests):

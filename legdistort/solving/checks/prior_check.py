@@ -43,19 +43,20 @@ def prior_check(solution, problem, state, *, error):
         return None
     if solution.gauge.plane is not None:  # a simpler correction
         return None
-    if problem.mean_sigma is not None and np.all(np.isinf(problem.mean_sigma)):  # nothing is believed
+    if problem.static_errors is not None and problem.static_errors.knows_nothing:  # nothing is believed
         return None
     if problem.n_exposures < 2:
         given = _given(_source(solution))
         return Check("prior", "unknown", None, None, f"{given} is believed, not tested: there is one exposure", _CURE)
     keep = drawn(problem.detectors, MOST // (2 * problem.n_modes))
     problem, state = part_of(problem, state, keep)
-    given, variance, group, first = stated(problem)
-    believed = np.isfinite(variance).any(axis=1) & (given.any(axis=1) | (variance > 0).any(axis=1))
+    given, spread, group, first = stated(problem)
+    known = np.isfinite(spread.variance).any(axis=1)
+    believed = known & (given.any(axis=1) | (spread.variance > 0).any(axis=1))
     if not believed.any():
         return None
     model = ExposureModel.of(problem, state, solution.gauge.all_motion[keep], group)
-    tests = static_tests(model, given, variance, [problem.shapes[i] for i in first])
+    tests = static_tests(model, given, spread, [problem.shapes[i] for i in first])
     tests = [(problem.names[i], test) for i, test, known in zip(first, tests, believed, strict=True) if known]
     source = _source(solution)
     return replace(_in_words(source, tests, error), tests=tuple(_factors(source, tests)))

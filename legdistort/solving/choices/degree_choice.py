@@ -216,7 +216,7 @@ def folding(fit, degree, higher):
     low, high = basis.n_modes(degree), slice(basis.n_modes(higher - 1), basis.n_modes(higher))
     departure, variance, excess_beside = _of_their_own(fit, high)
     excess = excess_beside()
-    curved = fit.problem.degree > 1 and np.any(fit.problem.mean_sigma)  # maps that are not known exactly
+    curved = fit.problem.degree > 1 and np.any(fit.problem.static_errors.sigma)  # maps that are not known exactly
     if excess > ALARM and curved:
         excess = excess_beside(_second_order(fit, low))
     energy = np.sum(departure**2)
@@ -314,7 +314,7 @@ def _second_order(fit, carried):
     coefficients = problem.prior_mean.copy()
     coefficients[:, :, :carried] = state.coefficients[:, :, :carried]
     whole = constraints.motion_with_distortion(problem, state.poses, coefficients, gauge.plane_modes())
-    sigma = np.minimum(problem.mean_sigma.max(axis=0), _UNKNOWN)
+    sigma = np.minimum(problem.static_errors.sigma.max(axis=0), _UNKNOWN)
     return (whole - gauge.motion) * np.repeat(sigma, problem.n_fields, axis=1).ravel()
 
 

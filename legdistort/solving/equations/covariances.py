@@ -337,7 +337,7 @@ class Uncertainty:
     def weak(self) -> tuple[UnknownDirection, ...]:
         """Directions of a distortion that exposures share and do not determine, as a tuple of `UnknownDirection`."""
         problem = self._problem
-        if not problem.unknowns.shared or problem.static_sigma is not None or not self.system.n_weak:
+        if not problem.unknowns.shared or problem.static_covariance is not None or not self.system.n_weak:
             return ()
         system = self.system
         made = []

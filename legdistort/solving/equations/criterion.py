@@ -25,7 +25,6 @@ from .star_terms import symmetric_times
 #: Weight on steps along directions that are fixed, relative to that of the data.
 _HOLD = 1e4
 #: Smallest uncertainty of a static distortion that takes part in a fit, pixels.
-_SMALLEST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +85,8 @@ def prior_precision(problem, i):
     """
     n = 2 * problem.n_modes
     out = np.zeros((n, n))
-    if problem.unknowns.shared and problem.static_sigma is not None:
-        out = problem.unknowns.common_precision(np.maximum(problem.static_sigma.ravel(), _SMALLEST))[i]
+    if problem.unknowns.shared and problem.static_covariance is not None:
+        out = problem.unknowns.common_precision(problem.static_covariance)[i]
     if not problem.has_widths(i):
         return out
     sigma = np.minimum(problem.prior_sigma[i].ravel(), 1e6)  # infinity stands for free

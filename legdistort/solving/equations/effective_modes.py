@@ -47,7 +47,8 @@ def effective_modes(problem, gauge, uncertainty):
     rows = criterion.complement(gauge.measured.T) @ gauge.orthonormal
     shares = (rows.reshape(len(rows), problem.n_exposures, -1) ** 2).sum(axis=(0, 2))
     fixed = 0 if problem.fixed is None else np.array([len(each) for each in problem.fixed])
-    return problem.unknowns.n_own - shares - fixed - done_by_prior(replace(problem, static_sigma=None), uncertainty)
+    of_exposures = replace(problem, static_covariance=None)
+    return problem.unknowns.n_own - shares - fixed - done_by_prior(of_exposures, uncertainty)
 
 
 def departure_ratio(problem, gauge, blocks, uncertainty):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...cameras.stated_errors import FREE, StaticErrors
 from ...exceptions import InputError, SolveError
 from ...geometry import basis
 from ...geometry.detector_modes import dynamic_basis, pose_departures, pose_widths, similarity_basis
@@ -51,11 +52,11 @@ class Problem:
         Inverse covariance: xx, yy, xy [1/pix^2]; zero for an observation that is left out.
     prior_mean : ndarray, shape (n_exposures, 2, n_all)
     prior_sigma : ndarray, shape (n_exposures, 2, n_modes), or None
-    static_sigma : ndarray, shape (2, n_modes), or None
-        Uncertainty of the prior mean; of several priors the largest.
-    mean_sigma : ndarray, shape (n_exposures, 2, n_modes), or None
-        The same by exposure: infinite where there is no prior, zero where it states none and counts as exact. None is
-        zero everywhere.
+    static_covariance : ndarray, shape (2 n_modes, 2 n_modes), or None
+        Of the prior mean where exposures share it; of several priors that differ the largest widths.
+    static_errors : StaticErrors or None
+        Uncertainty of the prior mean by exposure: infinite where there is no prior, zero where it states none and
+        counts as exact. None is zero everywhere.
     own_degree : int or None
         Up to this degree exposures have modes of their own; None: nothing is shared. See `Unknowns`.
     group : ndarray of int, shape (n_exposures,)
@@ -94,8 +95,8 @@ class Problem:
     weight: np.ndarray
     prior_mean: np.ndarray
     prior_sigma: np.ndarray | None = None
-    static_sigma: np.ndarray | None = None
-    mean_sigma: np.ndarray | None = None
+    static_covariance: np.ndarray | None = None
+    static_errors: StaticErrors | None = None
     own_degree: int | None = None
     group: np.ndarray | int = 0
     night: np.ndarray | int = 0
@@ -219,7 +220,14 @@ class Problem:
     @property
     def has_prior(self):
         """Whether widths of a prior take part in J."""
-        return self.prior_sigma is not None or (self.unknowns.shared and self.static_sigma is not None)
+        return self.prior_sigma is not None or (self.unknowns.shared and self.static_covariance is not None)
+
+    @property
+    def errors_of_statics(self):
+        """`static_errors`, of no size without any."""
+        if self.static_errors is None:
+            return StaticErrors(np.zeros((self.n_exposures, 2, self.n_modes)))
+        return self.static_errors
 
     def departure(self, coefficients):
         """How far fitted coefficients are from where their widths are centred, of those (n_exposures, 2, n_all) given.
@@ -395,7 +403,7 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
                 f"lower the degree (at most {_highest_degree(count)} here), give a prior with sigma, "
                 "or leave the exposure out"
             )
-    has_widths, mean_sigma = not free.all(), _mean_sigma(priors, degree)
+    has_widths, errors = not free.all(), StaticErrors.of(priors, degree)
     problem = Problem(
         degree=degree,
         names=matches.names,
@@ -408,9 +416,9 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
         weight=weight,
         prior_mean=mean,
         prior_sigma=sigma if has_widths else None,
-        static_sigma=_static_sigma(priors, degree),
-        mean_sigma=mean_sigma,
-        floats=has_widths and bool(np.isinf(mean_sigma[np.isfinite(sigma)]).all()),
+        static_covariance=_static_covariance(priors, degree),
+        static_errors=errors,
+        floats=has_widths and errors.covariances is None and bool(np.isinf(errors.sigma[np.isfinite(sigma)]).all()),
         own_degree=own_degree,
         group=_groups(matches),
         night=matches.blocks,
@@ -504,15 +512,12 @@ def _order(obs):
     return slice(None) if obs.is_sorted else np.argsort(obs.key, kind="stable")
 
 
-def _static_sigma(priors, degree):
-    given = [p.static_widths(degree) for p in priors if p is not None and p.static_sigma is not None]
-    return np.max(given, axis=0) if given else None
-
-
-def _mean_sigma(priors, degree):
-    free = np.full((2, basis.n_modes(degree)), np.inf)
-    made = {p: free if p is None else p.static_widths(degree) for p in dict.fromkeys(priors)}
-    return np.stack([made[p] for p in priors])
+def _static_covariance(priors, degree):
+    given = [p for p in dict.fromkeys(priors) if p is not None and p.static_sigma is not None]
+    if len(given) == 1 and given[0].static_covariance is not None:
+        covariance = given[0].static_covariance_to(degree)
+        return np.where(np.isinf(covariance), FREE**2, covariance)
+    return np.diag(np.max([p.static_widths(degree) for p in given], axis=0).ravel() ** 2) if given else None
 
 
 def _highest_degree(count):

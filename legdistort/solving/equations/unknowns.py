@@ -12,6 +12,8 @@ import numpy as np
 
 from ...geometry import basis, detector_modes
 
+_SMALLEST = 1e-6  # pixels: what is exact
+
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
@@ -141,10 +143,15 @@ class Unknowns:
             out[theirs, theirs] += common @ block @ common.T
         return out
 
-    def common_precision(self, sigma):
-        """How widths (2 n_modes,) constrain the common part, a share by exposure: (n_exposures, 2 n_modes, ...)."""
+    def common_precision(self, covariance):
+        """How a covariance (2 n_modes, 2 n_modes) constrains the common part: (n_exposures, 2 n_modes, 2 n_modes).
+
+        Every exposure has a share. What is exact counts as known to `_SMALLEST` pixels.
+        """
         common = self._rows[1]
-        whole = common.transpose(0, 2, 1) @ np.linalg.solve(common * sigma**2 @ common.transpose(0, 2, 1), common)
+        v, turned = np.linalg.eigh(common @ covariance @ common.mT)
+        whole = turned.mT @ common
+        whole = whole.mT / np.maximum(v, _SMALLEST**2)[:, None] @ whole
         return (whole / np.bincount(self.group)[:, None, None])[self.group]
 
     def conditional_covariances(self, blocks):

@@ -5,9 +5,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from ...cameras.stated_errors import StaticSpread
 from ...exceptions import SolveError
 from ...geometry import basis, similarity
-from ...geometry.detector_modes import dynamic_basis, row_variances, similarity_basis, similarity_poses
+from ...geometry.detector_modes import dynamic_basis, similarity_basis, similarity_poses
 from ...geometry.plane_modes import PlaneModes
 from ...results.gauge import Drift, Gauge
 from ...runtime.checks import check_choice
@@ -65,9 +66,9 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
     held = np.array([problem.has_widths(i) for i in range(problem.n_exposures)])
     error = conditional_errors(blocks.u_data + (0 if problem.pose_width is None else pose_precision(problem)))
     maps = _taken_back(problem, motion, modes, shared_shears)
-    static = _static_variance(problem, others, group, shared)
+    static = _static_spread(problem, others, group, shared)
     if settled:
-        static, dynamic = np.zeros_like(static), np.broadcast_to(np.eye(motion.shape[1]), error.shape)
+        static, dynamic = static.exact(), np.broadcast_to(np.eye(motion.shape[1]), error.shape)
     nightly, told = np.zeros((0, others.shape[1])), False
     drifting, drifts, rates = _drifts(problem, motion, others, shared_shears, all_drifts)
     if dynamic is None:
@@ -102,7 +103,7 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
         more_boxes=modes.boxes[1:] if modes.n_fields > 1 else None,
         covariance=covariance,
         unknown_maps=known.unknown,
-        static=_in_a_word(static, shared),
+        static=_in_a_word(static.variance, shared),
         prior=bool(held.any()),
         drift=drift,
         nights=float(np.sqrt(nightly.mean(axis=0).sum() / 8)) if len(nightly) else None,  # a mode has mean square 1/4
@@ -191,20 +192,19 @@ def _taken_back(problem, motion, modes, shared_shears):
     return rows[: np.count_nonzero(size > 1e-6)]
 
 
-def _static_variance(problem, others, group, shared):
-    """Variance (n_groups, K) of the static distortion of every detector: infinite where it is not known beforehand.
+def _static_spread(problem, others, group, shared):
+    """`StaticSpread` of the static distortion of every detector: infinite where it is not known beforehand.
 
     Where exposures share it and its uncertainty is not stated, it is sought and not known; neither is that of a single
     exposure, from which it may depart by any amount, unless widths say by how much.
     """
-    sigma = np.zeros((problem.n_exposures, 2, problem.n_modes)) if problem.mean_sigma is None else problem.mean_sigma
-    if shared:
-        sigma = np.where(sigma > 0, sigma, np.inf)
-    out = np.zeros((group.max() + 1, others.shape[1]))
-    np.maximum.at(out, group, row_variances(others, sigma.reshape(problem.n_exposures, -1)))
-    if problem.n_exposures == 1 and not problem.has_widths(0):  # nothing tells how far a single exposure departs
-        out[out == 0] = np.inf
-    return out
+    each = problem.errors_of_statics.spread(others, np.arange(problem.n_exposures))
+    first = np.unique(group, return_index=True)[1]
+    variance = np.zeros((len(first), others.shape[1]))
+    np.maximum.at(variance, group, each.variance)
+    if shared or (problem.n_exposures == 1 and not problem.has_widths(0)):
+        variance[variance == 0] = np.inf
+    return StaticSpread(each.directions[first], variance)
 
 
 def _in_a_word(static, shared):
@@ -238,14 +238,14 @@ def own_part(problem, state, blocks):
         return problem, state, blocks
     n = basis.n_modes(unknowns.gauge_degree)
     rows = np.concatenate([np.arange(n), problem.n_modes + np.arange(n)])
-    sigma, static, mean = problem.prior_sigma, problem.static_sigma, problem.mean_sigma
+    sigma, static, mean = problem.prior_sigma, problem.static_covariance, problem.static_errors
     own = replace(
         problem,
         degree=unknowns.gauge_degree,
         prior_mean=problem.prior_mean[:, :, :n],
         prior_sigma=None if sigma is None else sigma[:, :, :n],
-        static_sigma=None if static is None else static[:, :n],
-        mean_sigma=None if mean is None else mean[:, :, :n],
+        static_covariance=None if static is None else static[np.ix_(rows, rows)],
+        static_errors=None if mean is None else mean.to_modes(n),
         own_degree=None,
         group=None,
     )

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ...cameras.stated_errors import StaticSpread
 from ...geometry.detector_modes import dynamic_degrees
 from ..equations.elimination import inverse_exposure_blocks
 
@@ -55,8 +56,8 @@ def dynamic_covariance(problem, state, error, moved, others, night, group, stati
     others : ndarray, shape (n_exposures, K, 2 n)
     night, group : ndarray of int, shape (n_exposures,)
         See `legdistort.solving.gauge.hierarchy.Hierarchy`.
-    static : ndarray, shape (n_groups, K)
-        Variance of the static distortion of every detector: infinite where it is not known, zero where it is exact.
+    static : StaticSpread
+        Covariance of the static distortion of every detector: infinite where it is not known, zero where it is exact.
     """
     n_modes = problem.n_modes
     departure = (state.coefficients - problem.prior_mean)[:, :, :n_modes].reshape(problem.n_exposures, -1)
@@ -83,10 +84,10 @@ def _of_nights(problem, own, variance, counts, moved, night, group, static):
 
     Parameters are those of `_scatter`, of exposures, and `night` and `group` of `dynamic_covariance`.
     """
-    free = np.full((night.max() + 1, own.shape[1]), np.inf)
-    scatter2, _ = _scatter(own, variance, counts, moved, night, free)
+    shape = night.max() + 1, own.shape[1]
+    scatter2, _ = _scatter(own, variance, counts, moved, night, StaticSpread.of_rows(np.full(shape, np.inf)))
     if problem.night_sigma is not None:
-        return scatter2, np.full(free.shape, problem.night_sigma**2), True
+        return scatter2, np.full(shape, problem.night_sigma**2), True
     weight = counts / (variance + scatter2 + 1e-300)
     total = _sums(weight, night) + 1e-300
     means, moved = _sums(weight * own, night) / total, _sums(weight[:, :, None] * moved, night) / total[:, :, None]
@@ -94,12 +95,12 @@ def _of_nights(problem, own, variance, counts, moved, night, group, static):
     left, leverage = _fitted(*_common(means, moved, owner, static), counts * total, means)
     dof = np.maximum(counts.sum(axis=0) - leverage, 0.0).sum()
     if dof > 1 and np.sum(counts * total * left**2) < dof + SEEN * np.sqrt(2 * dof):
-        return scatter2, np.zeros(free.shape), True
-    shape = _falling(scatter2)
-    unit = np.sqrt(shape)
-    terms = means / unit, 1 / (total * shape), counts, moved / unit[:, None], owner, static / shape
+        return scatter2, np.zeros(shape), True
+    falling = _falling(scatter2)
+    unit = np.sqrt(falling)
+    terms = means / unit, 1 / (total * falling), counts, moved / unit[:, None], owner, static.divided(unit)
     found, odd = _scatter(*terms, robust=True)
-    return scatter2, odd[:, None] ** 2 * found * shape, dof > 1
+    return scatter2, odd[:, None] ** 2 * found * falling, dof > 1
 
 
 def _falling(variance):
@@ -114,8 +115,9 @@ def _falling(variance):
 
 def _common(own, moved, owner, static):
     """Design (n, K, m) of maps and of what those of an owner have in common, and inverse variances (m,) known of it."""
-    common = [(owner == g)[:, None, None] * np.eye(own.shape[1])[:, of > 0] for g, of in enumerate(static)]
-    known = np.minimum(static[static > 0], _LARGE**2 * np.sum(own**2) / max(own.size, 1) + 1e-300)
+    each = zip(static.directions, static.variance, strict=True)
+    common = [(owner == g)[:, None, None] * columns[:, of > 0] for g, (columns, of) in enumerate(each)]
+    known = np.minimum(static.variance[static.variance > 0], _LARGE**2 * np.sum(own**2) / max(own.size, 1) + 1e-300)
     return np.concatenate([moved, *common], axis=2), np.concatenate([np.zeros(moved.shape[2]), 1 / known])
 
 
@@ -130,8 +132,8 @@ def _scatter(own, variance, counts, moved, owner, static, *, robust=False):
     moved : ndarray, shape (n, K, m)
         How maps of the reference plane change them, which are fitted and taken out.
     owner : ndarray of int, shape (n,)
-    static : ndarray, shape (n_owners, K)
-        Variance of what is common to those of an owner.
+    static : StaticSpread
+        Covariance of what is common to those of an owner.
     robust : bool
         Give each of the n a factor of its own on the scatter.
 

@@ -31,6 +31,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import eigh
 
+from ...cameras.stated_errors import StaticSpread
 from ...geometry import basis
 from ...results.gauge import UnknownMap
 from ..equations.criterion import complement
@@ -67,8 +68,8 @@ class Hierarchy:
         part of the error.
     group : ndarray of int, shape (n_exposures,)
         Detector of every exposure.
-    static : ndarray, shape (n_groups, K)
-        Variance of A_0 by detector: infinite where it is not known, zero where it is exact.
+    static : StaticSpread
+        Covariance of A_0 by detector: infinite where it is not known, zero where it is exact.
     maps : ndarray, shape (m, 2 n)
         Orthonormal rows: the maps that every exposure can compensate (null space), similarities aside.
     modes : `legdistort.geometry.plane_modes.PlaneModes`
@@ -87,7 +88,7 @@ class Hierarchy:
     nightly: np.ndarray
     told: bool
     group: np.ndarray
-    static: np.ndarray
+    static: StaticSpread
     maps: np.ndarray
     modes: object
     power: np.ndarray
@@ -96,26 +97,27 @@ class Hierarchy:
     def rows(self, static):
         """Rows M' (D + E B E' + 1 S 1')^-1 of the constraints, (m + m', n_exposures, 2 n').
 
-        For a variance (n_groups, K) of A_0. Those of the maps that change with time come last.
+        For a `StaticSpread` of A_0. Those of the maps that change with time come last.
         """
         moved = self.others @ self.motion @ self.maps.T
         if self.drifts.shape[2]:
             moved = np.concatenate([moved, self.others @ self.drifts], axis=2)
         # D^-1 of what is moved, and of what all have in common, of which a share is left once B is integrated out
         weighted, common = self.weight @ moved, self.weight.copy()
-        for owners, variances in ((self.night, self.nightly if self.told else ()), (self.group, static)):
-            for owner, variance in enumerate(variances):
+        nights = StaticSpread.of_rows(self.nightly if self.told else self.nightly[:0])
+        for owners, spread in ((self.night, nights), (self.group, static)):
+            for owner, (directions, variance) in enumerate(zip(spread.directions, spread.variance, strict=True)):
                 mine = owners == owner
                 if variance.any() and mine.any():
                     share = common[mine]
-                    taken = share @ _integrated(variance, share.sum(axis=0))
+                    taken = share @ _integrated(directions, variance, share.sum(axis=0))
                     weighted[mine] -= taken @ weighted[mine].sum(axis=0)
                     common[mine] -= taken @ share.sum(axis=0)
         return (weighted.mT @ self.others).transpose(1, 0, 2)
 
     def convention(self, kind):
         """Rows (m + m', n_exposures, 2 n') of a convention by itself: A_0 at the prior mean."""
-        smallest = self.rows(np.zeros_like(self.static))
+        smallest = self.rows(self.static.exact())
         if kind == "mean":
             mean = np.einsum("bc,ikc,ika->bia", self.maps, self.others, self.others, optimize=True)
             return np.concatenate([mean, smallest[len(mean) :]])
@@ -142,7 +144,7 @@ class Hierarchy:
             Unknown maps, for which no constraint is made.
         """
         held = self.convention(kind)
-        if not (self.static.any() and len(self.maps)):  # exact: the convention is the posterior mean
+        if not (self.static.variance.any() and len(self.maps)):  # exact: the convention is the posterior mean
             return Constraints(held, self.maps.T, ())
         rows, n = self.rows(self.static), len(self.maps)
         flat = rows.reshape(len(rows), -1)
@@ -153,7 +155,7 @@ class Hierarchy:
             information = information - full[:n, n:] @ np.linalg.solve(full[n:, n:], full[n:, :n])
         metric = of_maps(self.metric, self.maps)
         curvature, vectors = eigh((information + information.T) / 2, metric)
-        is_unknown = np.isinf(self.static).any() & (curvature * LIMIT**2 < 1)
+        is_unknown = np.isinf(self.static.variance).any() & (curvature * LIMIT**2 < 1)
         known, unknown = vectors[:, ~is_unknown], vectors[:, is_unknown]
         if released is not None and unknown.shape[1]:
             inside = np.linalg.qr(unknown.T @ metric @ self.maps @ released)[0]
@@ -180,10 +182,10 @@ class Hierarchy:
         flat, by_exposure = rows.reshape(len(rows), -1), rows.transpose(1, 0, 2)
         inside = flat @ (self.dynamic @ by_exposure.mT).reshape(flat.shape[1], -1)
         on_modes = (by_exposure @ self.others.mT).transpose(1, 0, 2)
-        for owners, variances in ((self.night, self.nightly), (self.group, self.static)):
-            for owner, variance in enumerate(variances):
+        for owners, spread in ((self.night, StaticSpread.of_rows(self.nightly)), (self.group, self.static)):
+            for owner, covariance in enumerate(spread.finite):
                 common = on_modes[:, owners == owner].sum(axis=1)
-                inside += common * np.where(np.isfinite(variance), variance, 0) @ common.T
+                inside += common @ covariance @ common.T
         reach = flat @ (self.motion @ maps).reshape(flat.shape[1], -1)
         if m or rates.shape[2]:
             also = np.concatenate([self.drifts, rates], axis=2).reshape(flat.shape[1], -1)
@@ -212,13 +214,13 @@ class Constraints:
     unknown: tuple
 
 
-def _integrated(variance, total):
-    """``(V^-1 + W)^-1`` for variances (K,), perhaps zero or infinite, and W (K, K)."""
+def _integrated(directions, variance, total):
+    """``(V^-1 + W)^-1`` for variances (K,), perhaps zero or infinite, along columns (K, K), and W (K, K)."""
     known = np.isfinite(variance)
-    root = np.sqrt(np.where(known, variance, 1.0))
+    root = directions * np.sqrt(np.where(known, variance, 1.0))
     # without dividing by a variance of zero; one that is infinite has no V^-1
-    inner = np.diag(np.where(known, 1.0, 0.0)) + root[:, None] * total * root
-    return root[:, None] * np.linalg.solve(inner, np.diag(root))
+    inner = np.diag(np.where(known, 1.0, 0.0)) + root.T @ total @ root
+    return root @ np.linalg.solve(inner, root.T)
 
 
 def named(maps, gauge, positions):

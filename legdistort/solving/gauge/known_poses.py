@@ -65,7 +65,7 @@ def contradiction(problem, state, uncertainty, fields=None):
     if problem.pose_width is None:
         return ""
     squares = ((problem.pose_departure(state)[0] / problem.pose_width) ** 2).sum(axis=1)
-    plain = replace(problem, prior_sigma=None, static_sigma=None)
+    plain = replace(problem, prior_sigma=None, static_covariance=None)
     expected = squares.size * 4 - effective_modes.done_by_prior(plain, uncertainty).sum()
     if uncertainty.camera is not None:
         precision = criterion.pose_precision(problem)

@@ -134,7 +134,7 @@ def counts(problem, state, shown=1.0):
     """
     if not is_possible(problem):
         return False
-    if problem.prior_sigma is not None and problem.mean_sigma is not None and problem.mean_sigma.any():
+    if problem.prior_sigma is not None and problem.errors_of_statics.sigma.any():
         return True  # widths draw exposures to the mean of the prior, and not to the static distortion that they show
     n_free = problem.n_star * problem.n_stars + problem.unknowns.size - 2 * problem.n_modes * problem.n_fields
     if 2 * np.count_nonzero(problem.weight[0]) - n_free < LEFT:
@@ -213,7 +213,7 @@ class _Search:
         self.known = _Known.of(problem, top)
         highest = max(top, basis.degree_of(problem.prior_mean.shape[2]))
         mean = basis.change_degree(problem.prior_mean, highest)
-        plain = replace(problem, prior_sigma=None, static_sigma=None)
+        plain = replace(problem, prior_sigma=None, static_covariance=None)
         self.stated = self.problem = replace(plain, degree=top, own_degree=problem.degree, prior_mean=mean)
         self.loss = loss
         self.sizes, self.holds_sizes, self.settled = sizes, sizes is not None, False
@@ -333,8 +333,8 @@ class _Known:
     group : ndarray of int, shape (n_exposures,)
     width : ndarray, shape (n_exposures, K)
         Given scatter; NaN where it is found.
-    place : ndarray of int, shape (n_groups, K)
-        Which of the unknown statics each is; -1 where it is exact.
+    of_statics : sparse array, shape (n_groups * K, n_statics - n_nights * K)
+        S - m of every detector from what is not exact of it.
     static_width : ndarray, shape (n_statics,)
         Given; infinite where its size is found, NaN that of a night if it is.
     degrees : ndarray of int, shape (K,)
@@ -345,7 +345,7 @@ class _Known:
     others: np.ndarray
     group: np.ndarray
     width: np.ndarray
-    place: np.ndarray
+    of_statics: sparse.csr_array
     static_width: np.ndarray
     degrees: np.ndarray
 
@@ -353,15 +353,17 @@ class _Known:
     def of(cls, problem, top):
         """That of a problem."""
         others = np.stack([dynamic_basis(shape, problem.n_modes) for shape in problem.shapes])
-        _, variance, group, _ = stated(problem)
+        _, spread, group, _ = stated(problem)
         width = np.full(others.shape[:2], np.nan)
         for i in range(problem.n_exposures):
             if problem.has_widths(i):
                 width[i] = np.sqrt(row_variances(others[i], problem.prior_sigma[i].ravel()))
-        place = np.where(variance > 0, np.cumsum(variance > 0).reshape(variance.shape) - 1, -1)
+        free = spread.variance > 0
+        parts = [columns[:, of] for columns, of in zip(spread.directions, free, strict=True)]
         sigma = np.nan if problem.night_sigma is None else problem.night_sigma
-        static = np.append(np.sqrt(variance[variance > 0]), np.full(problem.n_nights * others.shape[1], sigma))
-        return cls(problem, top, others, group, width, place, static, dynamic_degrees(problem.n_modes))
+        static = np.append(np.sqrt(spread.variance[free]), np.full(problem.n_nights * others.shape[1], sigma))
+        of_statics = sparse.block_diag(parts, format="csr")
+        return cls(problem, top, others, group, width, of_statics, static, dynamic_degrees(problem.n_modes))
 
     @property
     def n_statics(self):
@@ -375,7 +377,8 @@ class _Known:
 
     def common(self, statics):
         """S - m + B of every exposure, (n_exposures, K)."""
-        out = np.append(statics, 0.0)[self.place[self.group]]
+        own = self.of_statics @ statics[: self.of_statics.shape[1]]
+        out = own.reshape(-1, len(self.degrees))[self.group]
         if self.n_nights:
             out = out + statics[-self.n_nights * len(self.degrees) :].reshape(self.n_nights, -1)[self.problem.nights]
         return out
@@ -424,9 +427,8 @@ class _Known:
         n, k, m = self.others.shape
         similar = np.stack([similarity_basis(shape, m // 2) for shape in self.problem.shapes])
         own = sparse.kron(sparse.eye_array(n), sparse.eye_array(k, m, k=m - k))
-        place = self.place[self.group].ravel()
-        on = np.flatnonzero(place >= 0)
-        static = sparse.csr_array((-np.ones(len(on)), (on, place[on])), (n * k, self.n_statics))
+        static = -self.of_statics[(self.group[:, None] * k + np.arange(k)).ravel()]
+        static.resize(n * k, self.n_statics)
         if self.n_nights:
             first = self.n_statics - self.n_nights * k
             theirs = (first + k * self.problem.nights[:, None] + np.arange(k)).ravel()

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from ...geometry.detector_modes import dynamic_basis, dynamic_degrees, row_variances
+from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from .factors import GIVEN, Factor
 from .posterior import most_likely
 from .reduced_data import ReducedData, reduced_data
@@ -63,7 +63,7 @@ class ExposureModel:
         group : ndarray of int, shape (n_exposures,)
             Number of the static distortion that every exposure departs from.
         """
-        problem = replace(problem, prior_sigma=None, static_sigma=None)
+        problem = replace(problem, prior_sigma=None, static_covariance=None)
         n, others = problem.n_modes, [dynamic_basis(shape, problem.n_modes) for shape in problem.shapes]
         rows = np.zeros((problem.n_exposures, len(others[0]), problem.n_exposures, 2 * n))
         for i, mine in enumerate(others):
@@ -112,11 +112,16 @@ class ExposureModel:
         size = np.tile(self.degrees - 1 + self.degrees.max(), self.n_nights) if found else np.full(m, GIVEN)
         return Factor("nights", rows, np.zeros(m), np.full(m, 1.0 if found else self.night_sigma), size)
 
-    def statics(self, *, size=GIVEN, width=np.nan):
-        """The factor on S_g - m_g: of one size that is found, or of given widths (n_groups, K)."""
+    def statics(self, *, size=GIVEN, width=np.nan, directions=None):
+        """The factor on S_g - m_g: of one size that is found, or of given widths (n_groups, K).
+
+        Widths are those along `directions` (n_groups, K, K), columns; of the coefficients if they are not given.
+        """
         n, k = self.departure.shape
         m = self.n_groups * k
         rows = sparse.eye_array(m, (n + self.n_nights + self.n_groups) * k, k=(n + self.n_nights) * k, format="csr")
+        if directions is not None:
+            rows = sparse.csr_array(sparse.block_diag(np.linalg.inv(directions)) @ rows)
         widths = np.broadcast_to(width, (self.n_groups, k)).ravel()
         return Factor("static distortion", rows, np.zeros(m), widths, np.full(m, size))
 
@@ -135,15 +140,15 @@ class ExposureModel:
 
 
 def stated(problem):
-    """Mean and variance (n_priors, K) of every prior, that of each exposure, and the first exposure of each.
+    """Mean (n_priors, K) and `StaticSpread` of every prior, that of each exposure, and the first exposure of each.
 
     Exposures of one detector with one prior depart from one distortion.
     """
     others = np.stack([dynamic_basis(shape, problem.n_modes) for shape in problem.shapes])
     mean = problem.prior_mean[:, :, : problem.n_modes].reshape(problem.n_exposures, -1, 1)
-    sigma = np.zeros(mean.shape) if problem.mean_sigma is None else problem.mean_sigma
-    variance = row_variances(others, sigma.reshape(problem.n_exposures, -1))
-    given = (others @ mean)[:, :, 0]
-    keys = np.column_stack([problem.detectors, given, variance])
-    _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    return given[first], variance[first], group.ravel(), first
+    errors = problem.errors_of_statics
+    given, number = (others @ mean)[:, :, 0], {}
+    correlated = [number.setdefault(None if c is None else c.tobytes(), len(number)) for c in errors.covariances or ()]
+    keys = [problem.detectors, given, errors.sigma.reshape(len(given), -1), *[correlated] * bool(correlated)]
+    _, first, group = np.unique(np.column_stack(keys), axis=0, return_index=True, return_inverse=True)
+    return given[first], errors.spread(others[first], first), group.ravel(), first

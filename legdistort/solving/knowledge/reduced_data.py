@@ -122,7 +122,7 @@ def part_of(problem, state, keep):
         weight=problem.weight[:, rows],
         prior_mean=problem.prior_mean[keep],
         prior_sigma=None if problem.prior_sigma is None else problem.prior_sigma[keep],
-        mean_sigma=None if problem.mean_sigma is None else problem.mean_sigma[keep],
+        static_errors=None if problem.static_errors is None else problem.static_errors.part(keep),
         group=group,
         field=field,
         night=problem.night if np.ndim(problem.night) == 0 else problem.night[keep],

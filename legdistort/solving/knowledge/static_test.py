@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
+from ...cameras.stated_errors import FREE
 from ...geometry import basis, detector_modes
 
 
@@ -27,8 +28,8 @@ class StaticTest:
         C^-1 (s - m).
     given : ndarray, shape (K,)
         m.
-    variance : ndarray, shape (K,)
-        Diagonal of V.
+    stated : ndarray, shape (K, K)
+        V.
     shape : tuple
         ``(ny, nx)`` of the detector.
     directions : ndarray, shape (k, K)
@@ -40,7 +41,7 @@ class StaticTest:
     information: np.ndarray
     slope: np.ndarray
     given: np.ndarray
-    variance: np.ndarray
+    stated: np.ndarray
     shape: tuple
     directions: np.ndarray
     dof_scatter: float = np.inf
@@ -48,13 +49,13 @@ class StaticTest:
     @property
     def wrong(self):
         """How far a wrong prior is from the truth (K,): by its mean, or by three of its widths if it has none."""
-        return self.given if self.given.any() else 3 * np.sqrt(self.variance)
+        return self.given if self.given.any() else 3 * np.sqrt(np.diag(self.stated))
 
     @cached_property
     def covariance(self):
         """Of s - m in these directions, if the prior is right, (k, k)."""
         d = self.directions
-        return np.linalg.inv(d @ self.information @ d.T) + d * self.variance @ d.T
+        return np.linalg.inv(d @ self.information @ d.T) + d @ self.stated @ d.T
 
     @cached_property
     def difference(self):
@@ -123,25 +124,28 @@ class StaticTest:
         return made
 
 
-def static_tests(model, given, variance, shapes):
+def static_tests(model, given, spread, shapes):
     """The prior of every detector tested by all else, a list of `StaticTest`.
 
     Parameters
     ----------
     model : ExposureModel
-    given, variance : ndarray, shape (n_groups, K)
-        Mean of the prior, and its variance; infinite where nothing is stated.
+    given : ndarray, shape (n_groups, K)
+        Mean of the prior.
+    spread : StaticSpread
+        Its covariance; infinite where nothing is stated.
     shapes : list of (ny, nx), by detector
     """
     posterior, sizes = model.posterior, model.posterior.sizes
     seen = posterior.without(model.free_statics)
-    tests = [_test(posterior, seen, *each) for each in enumerate(zip(given, variance, shapes, strict=True))]
+    known = list(zip(given, spread.directions, spread.variance, shapes, strict=True))
+    tests = [_test(posterior, seen, *each) for each in enumerate(known)]
     share = np.zeros((len(sizes) - 1, len(tests)))
     for j in range(len(share)):
         larger = replace(posterior, sizes=np.where(np.arange(len(sizes)) == j, 1.1 * sizes, sizes))
         seen = larger.without(model.free_statics)
         for g, test in enumerate(tests):
-            after = _test(larger, seen, g, (given[g], variance[g], test.shape), test.directions)
+            after = _test(larger, seen, g, known[g], test.directions)
             share[j, g] = np.log((test.statistic() + 1e-9) / (after.statistic() + 1e-9)) / np.log(1.1) / 2
     dof = 1 / (share**2 / np.maximum(posterior.determined[:-1, None], 1) + 1e-12).sum(axis=0)
     return [replace(test, dof_scatter=float(n)) for test, n in zip(tests, dof, strict=True)]
@@ -152,18 +156,24 @@ def _test(posterior, seen, g, known, directions=None):
 
     `seen` are information and slope of all statics from everything but what is known of them.
     """
-    (given, variance, shape), (information, slope) = known, seen
-    stated = np.isfinite(variance)
-    mine = np.zeros((len(slope) // len(given), len(given)), dtype=bool)
-    mine[g] = stated
-    mine = mine.ravel()
-    others = information[np.ix_(~mine, ~mine)] + np.eye(np.count_nonzero(~mine)) / posterior.sizes[-1] ** 2
+    (given, directions_given, variance, shape), (information, slope) = known, seen
+    k, stated = len(given), np.isfinite(variance)
+    turned, place = np.eye(len(slope)), slice(g * len(given), (g + 1) * len(given))
+    turned[place, place] = directions_given
+    information, slope = turned.T @ information @ turned, turned.T @ slope
+    mine = np.zeros(len(slope), dtype=bool)
+    mine[place] = stated
+    size = np.full(len(slope), posterior.sizes[-1])
+    size[place] = FREE  # of what is not known of this one
+    others = information[np.ix_(~mine, ~mine)] + np.diag(size[~mine] ** -2.0)
     across = information[np.ix_(mine, ~mine)]
     solved = np.linalg.solve(others, np.column_stack([across.T, slope[~mine]]))
-    whole, pull = np.zeros((len(given), len(given))), np.zeros(len(given))
+    whole, pull = np.zeros((k, k)), np.zeros(k)
     whole[np.ix_(stated, stated)] = information[np.ix_(mine, mine)] - across @ solved[:, :-1]
     pull[stated] = slope[mine] - across @ solved[:, -1]
-    test = StaticTest(whole, pull, given, np.where(stated, variance, 0), shape, directions)
+    whole, pull = directions_given @ whole @ directions_given.T, directions_given @ pull
+    covariance = directions_given * np.where(stated, variance, 0) @ directions_given.T
+    test = StaticTest(whole, pull, given, covariance, shape, directions)
     if directions is not None:
         return test
     values, vectors = np.linalg.eigh(whole)

@@ -1,0 +1,208 @@
+"""Errors of static distortions as callers state them, widths or a covariance, and as they count in a solution."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ..exceptions import InputError
+from ..geometry import basis
+from ..geometry.detector_modes import row_variances
+
+#: Error of a coefficient, or of a combination of them, from which on nothing is known of it [pix].
+UNKNOWN = 100.0
+#: Error of what nothing is known of, where digits count [pix].
+FREE = 1e3
+_EXACT = 1e-12  # variance, of the largest, that is rounding
+_ROUNDING = 1e-9  # of the largest variance
+
+
+def as_widths(value, n, name):
+    """Standard deviations given as a number, per mode or per axis and mode, as (2, n); None as None.
+
+    Raises
+    ------
+    InputError
+        For other shapes, and what is negative or NaN.
+    """
+    if value is None:
+        return None
+    try:
+        out = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be widths in pixels, got {value!r}") from None
+    try:
+        out = np.broadcast_to(out, (2, n)).copy()
+    except ValueError:
+        raise InputError(
+            f"{name} must be a number, one per mode ({n},) or per axis and mode (2, {n}), got shape {out.shape}"
+        ) from None
+    if not np.all(out >= 0):
+        raise InputError(f"{name} must be 0 or more (a standard deviation in pixels), got {value!r}")
+    return out
+
+
+def as_covariance(value, n, name):
+    """A covariance (2 n, 2 n) of coefficients, symmetric, infinite variances by themselves; None as None.
+
+    Raises
+    ------
+    InputError
+        For what is none.
+    """
+    if value is None:
+        return None
+    try:
+        out = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be numbers, a covariance in px^2, got {value!r}") from None
+    if out.shape != (2 * n, 2 * n):
+        raise InputError(f"{name} must be a covariance of shape ({2 * n}, {2 * n}) in px^2, got shape {out.shape}")
+    unknown = np.isposinf(np.diag(out))
+    out[unknown] = out[:, unknown] = 0.0
+    if not np.isfinite(out).all():
+        raise InputError(f"{name} must be numbers, but for infinite variances of coefficients that are not known")
+    largest = np.abs(np.diag(out)).max(initial=0)
+    if np.abs(out - out.T).max(initial=0) > _ROUNDING * largest:
+        raise InputError(f"{name} must be a covariance in px^2, and is not symmetric")
+    out = (out + out.T) / 2
+    if np.linalg.eigvalsh(out).min(initial=0) < -_ROUNDING * largest:
+        raise InputError(f"{name} must be a covariance in px^2, and gives a combination a negative variance")
+    out[unknown, unknown] = np.inf
+    return out
+
+
+def as_errors(widths, covariance, n, names):
+    """Both `as_widths` (2, n) and `as_covariance` (2 n, 2 n), of which one is given; the widths are its diagonal then.
+
+    Infinite from `UNKNOWN` pixels on.
+
+    Raises
+    ------
+    InputError
+        As these do; if both are given and differ.
+    """
+    sigma, covariance = as_widths(widths, n, names[0]), as_covariance(covariance, n, names[1])
+    if covariance is None:
+        return sigma, None
+    out = np.sqrt(np.maximum(np.diag(covariance), 0)).reshape(2, n)
+    out = np.where(out < UNKNOWN, out, np.inf)
+    if sigma is not None and not np.allclose(sigma, out, rtol=1e-6, atol=0):
+        raise InputError(f"{names[0]} and {names[1]} differ: give one of them, and the other as None")
+    return out, covariance
+
+
+def resized(covariance, n):
+    """A covariance (2 m, 2 m) for another number n of modes per axis, those beyond exact; None as None."""
+    if covariance is None:
+        return None
+    m = len(covariance) // 2
+    out, kept = np.zeros((2, n, 2, n)), min(n, m)
+    out[:, :kept, :, :kept] = covariance.reshape(2, m, 2, m)[:, :kept, :, :kept]
+    return out.reshape(2 * n, 2 * n)
+
+
+@dataclass(frozen=True, eq=False)
+class StaticErrors:
+    """Errors of the static distortion that is stated for every exposure.
+
+    Attributes
+    ----------
+    sigma : ndarray, shape (n_exposures, 2, n_modes)
+        Standard deviations: infinite where nothing is stated, zero where it is exact.
+    covariances : tuple of ndarray (2 n_modes, 2 n_modes) or None, or None
+        Those of exposures whose prior has one; None without any.
+    """
+
+    sigma: np.ndarray
+    covariances: tuple | None = None
+
+    @classmethod
+    def of(cls, priors, degree):
+        """Those of priors, or None, of every exposure."""
+        free = np.full((2, basis.n_modes(degree)), np.inf)
+        made = {p: (free, None) if p is None else (p.static_widths(degree), p.static_covariance_to(degree))
+                for p in dict.fromkeys(priors)}  # fmt: skip
+        several = any(covariance is not None for _, covariance in made.values())
+        return cls(np.stack([made[p][0] for p in priors]), tuple(made[p][1] for p in priors) if several else None)
+
+    def part(self, keep):
+        """Those of some exposures (k,)."""
+        covariances = self.covariances and tuple(self.covariances[i] for i in keep)
+        return StaticErrors(self.sigma[keep], covariances)
+
+    def to_modes(self, n):
+        """Those of the first n modes."""
+        kept = (np.arange(2)[:, None] * self.sigma.shape[2] + np.arange(n)).ravel()
+        covariances = self.covariances and tuple(c if c is None else c[np.ix_(kept, kept)] for c in self.covariances)
+        return StaticErrors(self.sigma[:, :, :n], covariances)
+
+    @cached_property
+    def knows_nothing(self):
+        """Whether nothing is stated of any mode of any exposure."""
+        correlated = self.covariances is not None and any(c is not None for c in self.covariances)
+        return not correlated and bool(np.isinf(self.sigma).all())
+
+    def spread(self, rows, first):
+        """The `StaticSpread` of some exposures (k,), on rows (k, K, 2 n_modes) of `dynamic_basis`."""
+        some = self.part(first)
+        return StaticSpread.of(rows, some.sigma.reshape(len(some.sigma), -1), some.covariances)
+
+
+@dataclass(frozen=True, eq=False)
+class StaticSpread:
+    """Covariances ``V_g = D_g diag(v_g) D_g'`` of static distortions, on the rows of `dynamic_basis`.
+
+    Attributes
+    ----------
+    directions : ndarray, shape (n, K, K)
+        Columns of D.
+    variance : ndarray, shape (n, K)
+        Infinite along what is not known, zero along what is exact.
+    """
+
+    directions: np.ndarray
+    variance: np.ndarray
+
+    @classmethod
+    def of(cls, rows, sigma, covariances=None):
+        """That by widths (n, 2 n_modes), or by covariances where these are not None.
+
+        Parameters
+        ----------
+        rows : ndarray, shape (n, K, 2 n_modes)
+        sigma : ndarray, shape (n, 2 n_modes)
+        covariances : sequence of n ndarray (2 n_modes, 2 n_modes) or None, optional
+        """
+        out = cls.of_rows(row_variances(rows, sigma))
+        if covariances is None:
+            return out
+        directions, variance = out.directions.copy(), out.variance
+        for g, covariance in enumerate(covariances):
+            if covariance is not None:
+                known = np.where(np.isinf(covariance), FREE**2, covariance)
+                v, directions[g] = np.linalg.eigh(rows[g] @ known @ rows[g].T)
+                v = np.where(v > _EXACT * v.max(initial=0), v, 0.0)
+                variance[g] = np.where(v < UNKNOWN**2, v, np.inf)
+        return cls(directions, variance)
+
+    @classmethod
+    def of_rows(cls, variance):
+        """That by variances (n, K) of the rows themselves."""
+        return cls(np.broadcast_to(np.eye(variance.shape[1]), (*variance.shape, variance.shape[1])), variance)
+
+    def exact(self):
+        """As if all were exact."""
+        return replace(self, variance=np.zeros_like(self.variance))
+
+    def divided(self, size):
+        """Those of coefficients that are divided by some sizes (K,)."""
+        directions = self.directions / size[:, None]
+        length = np.linalg.norm(directions, axis=1)
+        return StaticSpread(directions / length[:, None], self.variance * length**2)
+
+    @property
+    def finite(self):
+        """V (n, K, K), nothing of what is not known."""
+        known = np.where(np.isfinite(self.variance), self.variance, 0.0)
+        return self.directions * known[:, None] @ self.directions.mT
