@@ -164,15 +164,11 @@ def _cluster_needed(client):
 def _check_versions(client):
     """Raise `LegdistortError` if workers of a cluster have another version of the package, or none."""
     own, cure = _version(), "install the same version there"
-    try:
-        found = client.run(_version)
-    except Exception as error:
-        if client.status != "running":
-            raise
-        raise LegdistortError(
-            f"the workers of the cluster cannot load legdistort ({first_line(error)}): {cure}"
-        ) from None
-    others = sorted(set(found.values()) - {own})
+    found = client.run(_version, on_error="return").values()
+    for error in found:
+        if isinstance(error, Exception) and not isinstance(error, OSError):  # one that died since is started again
+            raise LegdistortError(f"workers of the cluster cannot load legdistort ({first_line(error)}): {cure}")
+    others = sorted({each for each in found if isinstance(each, str)} - {own})
     if others:
         raise LegdistortError(f"workers of the cluster have legdistort {', '.join(others)}, here it is {own}: {cure}")
 

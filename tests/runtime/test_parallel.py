@@ -24,6 +24,8 @@ import pytest
 from astropy.io import fits
 from astropy.nddata import CCDData
 from caller_warnings import warns_here
+from night_sets import SIZE, field
+from rolled_night import night as rolled_night
 from stacks import SHAPE, expose, scene
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -412,6 +414,32 @@ def test_nights_side_by_side_give_the_same_bits(client, tmp_path):
         assert json.dumps(there.summary["checks"]) == json.dumps(mine.summary["checks"])
         assert sorted(os.listdir(folder / "shared")) == sorted(os.listdir(folder / "here"))
     assert len({future.result().solution.chi2 for future in futures[:2]}) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("after", [0.0, 1.5])
+def test_nights_are_added_alike_by_a_cluster_that_loses_a_worker(tmp_path, after):
+    """Whether it is killed before or while it works on them: what nights say is added, and is the same to rounding."""
+    distributed, paths = pytest.importorskip("distributed"), []
+    static = field(np.random.default_rng(5), 1.5)
+    for i in range(8):
+        table = rolled_night(
+            i, static + field(np.random.default_rng(10 + i), 0.02), n_stars=70, exposures=6, year=2015 + i
+        )
+        paths.append(tmp_path / f"{i}.asdf")
+        ld.solve(ld.Matches.from_table(table, shape=(SIZE, SIZE))).write(paths[-1])
+    alone = ld.combine_nights(paths, workers=1)
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster,
+        cluster.get_client() as client,
+    ):
+        killed = next(iter(client.run(os.getpid).values()))
+        timer = threading.Timer(after, os.kill, (killed, signal.SIGKILL))
+        timer.start()
+        shared = ld.combine_nights(paths)
+        timer.join()
+    for one, other in zip(alone.static(), shared.static(), strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-12)
 
 
 # --- planes on disk -----------------------------------------------------------------------------------------------
