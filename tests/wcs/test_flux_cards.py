@@ -73,6 +73,22 @@ def test_where_no_fluxes_tell_it_no_text_has_it(one, tmp_path, caplog, known):
     assert "5 common stars" in said[0]
 
 
+def test_fluxes_of_stars_are_on_one_scale(one):
+    """Whichever exposures see a star."""
+    solution, true = solved(one, seen=0.5, outliers=0.0)
+    stars = solution.stars
+    np.testing.assert_allclose(stars["flux"] / true[np.asarray(stars["star"])], 1, rtol=0.04)
+    assert stars["flux"].info.description.endswith("scaled to their mean depth by the fluxes of common stars")
+
+
+def test_fluxes_that_nothing_compares_are_their_means(one):
+    solution, _ = solved(one, **FEW)
+    rows = solution.residuals[solution.residuals["used"]]
+    star = solution.stars["star"][0]
+    assert solution.stars["flux"][0] == pytest.approx(np.mean(rows["flux"][rows["star"] == star]))
+    assert solution.stars["flux"].info.description == "mean over the exposures as they are, whatever their depths"
+
+
 def test_exposures_in_a_chain_and_groups_of_detectors():
     """Neighbours alone have common stars; two detectors are joined by stars that cross, a third by none."""
     rng, n = np.random.default_rng(1), 30
