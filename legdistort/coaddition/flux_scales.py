@@ -82,7 +82,10 @@ def _factors(frames, scale, views, areas):
         if np.all(np.abs(off) <= np.maximum(_SAME, 3 * stars.errors)):
             of_all = factors[place[:, 0]] * of_detectors[place[:, 1]]
             return of_all, "exptime, stars" if sensitive and len(detectors) > 1 else "exptime"
-        log.info("by their stars exposures differ in depth by up to %.1f %% more than by time", 100 * max(abs(off)))
+        log.info(
+            "the transparency changed: by exposure, stars have %.2f to %.2f of the light that exposure times tell; "
+            "their fluxes, not times, bring exposures to one scale", np.exp(-off.max()), np.exp(-off.min()),
+        )  # fmt: skip
     factors = np.exp(stars.exposures)
     if None not in times:  # the mean exposure time stays what it is
         factors *= np.sum(times) / np.sum(factors * times)
