@@ -7,19 +7,17 @@ import logging
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
+from ..cameras.star_scales import FEW, star_scales
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..inputs.exposure_names import whole_name
 from ..inputs.frames.integrations import value_time
 from ..inputs.frames.value_units import value_unit
 from .options import by_name
-from .pairs import median_differences, values_from_differences
 
 log = logging.getLogger(__name__)
 
 _SAME = 0.02  # by which fluxes of stars must differ from the exposure times to be preferred
-_FEW = 5  # common stars that two exposures must have
 
 
 def flux_scales(frames, scale, views, areas=None):
@@ -69,24 +67,26 @@ def _factors(frames, scale, views, areas):
     stars = _star_scales(views, place, areas)
     if stars is None and scale == "stars":
         raise InputError(
-            f"scale='stars': the solution has no fluxes of {_FEW} common stars or more that join all exposures; "
+            f"scale='stars': the solution has no fluxes of {FEW} common stars or more that join all exposures; "
             "give scale='exptime' or a dict by exposure"
         )
     times = _times(first)
     if stars is None:
         return _time_scales(first, times)[place[:, 0]], "exptime"
-    (logs, errors), (of_detectors, their_errors) = stars
-    sensitive = scale == "stars" or np.any(np.abs(of_detectors) > 3 * their_errors)
-    of_detectors = np.exp(of_detectors) if sensitive else np.ones(len(detectors))
+    sensitive = scale == "stars" or np.any(np.abs(stars.detectors) > 3 * stars.detector_errors)
+    of_detectors = np.exp(stars.detectors) if sensitive else np.ones(len(detectors))
     if scale == "auto" and (None not in times or len(set(times)) == 1):
         factors = _time_scales(first, times)
-        off = logs - np.log(factors)
+        off = stars.exposures - np.log(factors)
         off -= np.median(off)
-        if np.all(np.abs(off) <= np.maximum(_SAME, 3 * errors)):
+        if np.all(np.abs(off) <= np.maximum(_SAME, 3 * stars.errors)):
             of_all = factors[place[:, 0]] * of_detectors[place[:, 1]]
             return of_all, "exptime, stars" if sensitive and len(detectors) > 1 else "exptime"
-        log.info("by their stars exposures differ in depth by up to %.1f %% more than by time", 100 * max(abs(off)))
-    factors = np.exp(logs - np.mean(logs))
+        log.info(
+            "the transparency changed: by exposure, stars have %.2f to %.2f of the light that exposure times tell; "
+            "their fluxes, not times, bring exposures to one scale", np.exp(-off.max()), np.exp(-off.min()),
+        )  # fmt: skip
+    factors = np.exp(stars.exposures)
     if None not in times:  # the mean exposure time stays what it is
         factors *= np.sum(times) / np.sum(factors * times)
     return factors[place[:, 0]] * of_detectors[place[:, 1]], "stars"
@@ -117,70 +117,14 @@ def _time_scales(frames, times):
 
 
 def _star_scales(views, place, areas):
-    """Logarithms of factors of exposures, and of detectors, by the fluxes of common stars, each with their errors.
-
-    Exposures are compared where a detector sees the same stars in both; detectors by the stars that fall on one in an
-    exposure and on the other in the next. Detectors without such stars keep the scale that they have.
-
-    Parameters
-    ----------
-    views, areas
-        As for `flux_scales`.
-    place : ndarray of int, shape (n, 2)
-        Exposure and detector of each.
-
-    Returns
-    -------
-    tuple of tuple of ndarray, or None
-        None if stars do not join all exposures.
-    """
+    """The `StarScales` of images, of whose exposures and detectors `place` (n, 2) has the numbers; None without."""
     seen = [view.residuals for view in views.values()]
     if any("flux" not in rows.colnames for rows in seen):
         return None
     part = np.repeat(np.arange(len(seen)), [len(rows) for rows in seen])
     flux, used, star = (np.concatenate([np.asarray(rows[key]) for rows in seen]) for key in ("flux", "used", "star"))
-    good = used.astype(bool) & np.isfinite(flux) & (flux > 0)
-    stars, star = np.unique(star[good], return_inverse=True)
-    if len(stars) < _FEW:
-        return None
-    part = part[good]
-    logs = np.log(flux[good]) - np.log([areas.get(name, 1.0) for name in views])[part]
+    flux = flux / np.array([areas.get(name, 1.0) for name in views])[part]
+    used = used.astype(bool)
     exposure, detector = place[part].T
-    on_detector = np.unique(np.stack([detector, star]), axis=1, return_inverse=True)[1].ravel()
-    scales = _compared(exposure, on_detector, logs, len(set(place[:, 0])))
-    if scales is None:
-        return None
-    logs = logs + scales[0][exposure]
-    n_detectors = len(set(place[:, 1]))
-    if n_detectors == 1:
-        return scales, np.zeros((2, 1))
-    return scales, _compared(detector, star, logs, n_detectors, joined=False)
-
-
-def _compared(row, column, logs, n, joined=True):
-    """Logarithms (n,) of factors that make the fluxes in each column agree, and their errors.
-
-    Differences between rows are medians over their common columns, the brighter half of all; the factors follow from
-    all pairs by least squares. None if these do not join all rows; where they need not, the others have zero, with an
-    infinite error.
-    """
-    total, count = np.zeros((2, n, column.max() + 1))
-    np.add.at(total, (row, column), logs)
-    np.add.at(count, (row, column), 1)
-    with np.errstate(invalid="ignore"):
-        samples = total / count
-    middle = np.nanmedian(samples, axis=0)
-    samples = samples[:, middle >= np.median(middle)]
-    difference, common = median_differences(samples)
-    common[common < _FEW] = 0
-    n_groups, group = connected_components(common, directed=False)
-    if joined and n_groups > 1:
-        return None
-    values = values_from_differences(difference, common, np.zeros(n))
-    rest = samples - values[:, None]
-    rest -= np.nanmedian(rest, axis=0)
-    rest[~np.isfinite(rest).any(axis=1)] = 0.0
-    with np.errstate(invalid="ignore", divide="ignore"):
-        errors = 1.4826 * 1.2533 * np.nanmedian(np.abs(rest), axis=1) / np.sqrt(np.isfinite(rest).sum(axis=1))
-    errors[np.bincount(group)[group] == 1] = np.inf if n > 1 else 0.0
-    return -values, errors
+    known = (each[used] for each in (exposure, detector, star, flux))
+    return star_scales(*known, *(place.max(axis=0) + 1).tolist())

@@ -62,7 +62,7 @@ STARS = {
     "field": ("meta.code", "number of the field, from 1, of exposures that have common stars"),
     "group": ("meta.code", "which detectors saw it, of those that nothing ties to others; errors hold within"),
     "reference_used": ("meta.code", "whether the position in the reference catalogue counts among what is known of it"),
-    "flux": ("phot.flux;stat.mean", "mean over the exposures"),
+    "flux": ("phot.flux;stat.mean", "mean over the exposures as they are, whatever their depths"),
     "ra": ("pos.eq.ra;meta.main", "right ascension, ICRS"),
     "dec": ("pos.eq.dec;meta.main", "declination, ICRS"),
     "ra_error": ("stat.error;pos.eq.ra", "standard deviation of ra times cos(dec), after a common map is taken off"),
@@ -71,6 +71,8 @@ STARS = {
     "ra_error_abs": ("stat.error;pos.eq.ra", "the same with the common map, apart from the pointing"),
     "dec_error_abs": ("stat.error;pos.eq.dec", "the same with the common map, apart from the pointing"),
 }
+
+_FLUX_AT_MEAN_DEPTH = "mean over the exposures, each scaled to their mean depth by the fluxes of common stars"
 
 #: Names that a column of colours of stars may have.
 COLOURS = "colour", "color", "bp_rp", "colour_index"
@@ -118,13 +120,18 @@ CORRELATIONS = {
 }
 
 
-def describe_stars(table):
-    """Give the columns of a table of stars their UCDs and meanings (`STARS`, `MOTIONS`); returns the table."""
+def describe_stars(table, one_scale=False):
+    """Give the columns of a table of stars their UCDs and meanings (`STARS`, `MOTIONS`); returns the table.
+
+    With `one_scale` fluxes of the exposures were brought to one scale.
+    """
     known = CORRELATIONS | STARS | MOTIONS
     for name in table.colnames:
         if name in known:
             ucd, table[name].info.description = known[name]
             table[name].info.meta = {"ucd": ucd}
+    if one_scale:
+        table["flux"].info.description = _FLUX_AT_MEAN_DEPTH
     return table
 
 

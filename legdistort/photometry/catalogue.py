@@ -112,7 +112,7 @@ class Catalogue(ShownAsPrinted):
             f"{repr(self)[1:-1]}\n"
             f"above {meta['threshold']:g} times the noise of all exposures together, where {meta['noise_peaks']:.2g} "
             f"peaks of noise are expected in {meta['area']} px^2\n"
-            f"{meta['n_rejected']} peaks left out that one exposure alone shows"
+            f"{meta['n_rejected']} peaks left out that one exposure alone shows, or none"
             f"{compared}"
         )
 

@@ -80,7 +80,7 @@ def at_places(field, measured, names, xy):
         field.remove(cKDTree(xy).query(field.xy)[0] < SAME * field.fwhm)
     first, begin = len(field.flux), _BEGIN * np.median(field.flux) if len(field.flux) else 1.0
     field.add(xy, np.full(len(xy), begin))
-    seen = field.snr()[first:] > 0
+    seen = np.isfinite(by_image(field, first + np.arange(len(xy)))[1]).any(axis=0)
     if not seen.all():
         off = some_of([str(name) for name in names[~seen]], _NAMED)
         if not seen.any():

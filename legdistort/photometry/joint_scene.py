@@ -224,11 +224,16 @@ class JointScene(JointFit):
         return np.sqrt(self._by_layer(lambda scene, own: scene.snr(own) ** 2, rows).sum(axis=0))
 
     def unit_snr(self, xy):
-        """Ratios of signal to noise that stars of unit flux at some places would have by what is there now; (n,)."""
+        """Ratios of signal to noise that stars of unit flux at some places would have by what is there now; (n,).
+
+        Zero where no image sees them.
+        """
         total = np.zeros(len(xy))
         for layer in self.layers:
             place, there = layer.local(xy)
-            total[there] += (layer.transmission * layer.scene.unit_snr(place.pixel[there])) ** 2
+            square = layer.scene.unit_snr(place.pixel[there]) ** 2
+            seen = square > _LEAST * layer.scene.usual_information
+            total[there] += np.where(seen, layer.transmission**2 * square, 0)
         return np.sqrt(total)
 
     def core_chi2(self, rows=None):

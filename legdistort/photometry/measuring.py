@@ -39,7 +39,7 @@ class Measured:
         Relative errors of the transmissions.
     varying : ndarray of bool, shape (n,)
     rejected : int
-        What was found and is no star: seen by one exposure alone.
+        What was found and is no star: seen by one exposure alone, or by none.
     """
 
     flux: np.ndarray
@@ -167,7 +167,8 @@ def by_image(field, rows=None):
 def judged(flux, error, mean, snr, threshold):
     """What is no star, since one exposure alone shows it, which stars vary, and which exposures are spoiled.
 
-    A star that three exposures see stands without the strongest of them. Below a signal-to-noise ratio of 30 its
+    What no exposure sees is none either: its light comes from beyond the pixels that count, where nothing holds its
+    flux. A star that three exposures see stands without the strongest of them. Below a signal-to-noise ratio of 30 its
     fluxes scatter as their errors state; or those of all exposures but one do, in which it is too bright; or two
     exposures confirm it by themselves and it varies.
 
@@ -196,7 +197,8 @@ def judged(flux, error, mean, snr, threshold):
     spoiled[highest, stars] = scatter & ~lone & ~_scatter(others, flux, rest)
     varying = scatter & ~spoiled.any(axis=0)
     confirmed = (ratio > _SEEN).sum(axis=0) >= 2
-    return lone | (varying & ~confirmed), varying & confirmed & ~lone, spoiled
+    gone = lone | (count == 0)
+    return gone | (varying & ~confirmed), varying & confirmed & ~gone, spoiled
 
 
 def _without(weight, flux, left_out):

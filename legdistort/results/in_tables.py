@@ -9,6 +9,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 from ..cameras import ties
+from ..cameras.star_scales import flux_factors
 from ..exceptions import by_reason, some_of
 from ..geometry import basis
 from ..geometry.epochs import year
@@ -44,9 +45,11 @@ def stars(solution, time=None):
     if solution.camera.has_focal_plane and _are_apart(solution, used):
         table["group"] = np.full(len(table), -1)
         table["group"][index] = solution.camera.group_of(used)
+    factors = flux_factors(solution)
     if "flux" in used.colnames:
+        flux = used["flux"] if factors is None else used["flux"] * factors.of_rows(used, solution.camera)
         with np.errstate(invalid="ignore"):
-            table["flux"] = np.bincount(index, used["flux"], len(table)) / table["n"]
+            table["flux"] = np.bincount(index, flux, len(table)) / table["n"]
     obstime = None if at is None else Time(at, format="jyear")
     if sky is not None:
         new_positions.add_sky(table, sky, xy, variance, absolute)
@@ -57,7 +60,7 @@ def stars(solution, time=None):
             moving = {"pm_ra_cosdec": table["pmra"], "pm_dec": table["pmdec"]}
             table["sky"] = SkyCoord(table["ra"], table["dec"], **moving, frame="icrs", obstime=obstime)
     table.meta = _meta(solution) | {"epoch": at}
-    return column_contract.describe_stars(table)
+    return column_contract.describe_stars(table, one_scale=factors is not None)
 
 
 def _along_paths(solution, time):

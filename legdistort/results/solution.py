@@ -222,7 +222,9 @@ class Solution(ShownAsPrinted):
         poses. These errors include them only where a reference ties them. On the sky:
         ``ra``, ``dec`` [deg, ICRS], ``ra_error`` (of ra cos(dec)), ``dec_error`` [mas], ``ra_dec_corr``,
         ``ra_error_abs``, ``dec_error_abs`` [mas], named as in the Gaia catalogue, and ``sky``, the same places as a
-        `~astropy.coordinates.SkyCoord` (not in files). ``meta`` has ``frame``, ``epoch`` (a Julian year, if it is
+        `~astropy.coordinates.SkyCoord` (not in files). ``flux`` is the mean over the exposures, each brought to their
+        mean depth by the fluxes of common stars; where these do not join the exposures, as they are, which the
+        description of the column says. ``meta`` has ``frame``, ``epoch`` (a Julian year, if it is
         known), ``gauge``, ``degree``, ``pixel_scale`` (arcsec, of the sky or as stated), ``prior`` and ``version``.
 
         Where motions were fitted, positions are those of the epoch, and there are ``vx``, ``vy`` [pix/yr], with a sky

@@ -40,8 +40,8 @@ def check_file(path, *, overwrite=False):
     Raises
     ------
     InputError
-        If `path` is a folder, a device or a pipe, or exists and `overwrite` is false, or its folder does not exist or
-        cannot be written.
+        If `path` is a folder, a device or a pipe, or exists and `overwrite` is false, or its folder cannot be made or
+        written.
     """
     path = Path(path)
     if path.is_dir():
@@ -50,9 +50,7 @@ def check_file(path, *, overwrite=False):
         raise InputError(f"{path} is a device or a pipe; give the name of a file")
     if path.exists() and not overwrite:
         raise InputError(f"{path} exists already; give overwrite=True (--overwrite) to replace it, or another name")
-    if not path.parent.is_dir():
-        raise InputError(f"the folder {path.parent} does not exist; make it first")
-    _check_permission(path, path.parent)
+    _check_permission(path, _existing_folder(path.absolute().parent))
 
 
 def check_ending(path, endings):
@@ -90,10 +88,15 @@ def check_folder(out):
     if not isinstance(out, (str, os.PathLike)):
         raise InputError(f"out must be a path, that of the folder for the results, got {out!r}")
     out = Path(out)
-    existing = next(place for place in (out, *out.absolute().parents) if place.exists())
+    _check_permission(out, _existing_folder(out))
+
+
+def _existing_folder(folder):
+    """A folder, or the nearest above it that exists."""
+    existing = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     if not existing.is_dir():
         raise InputError(f"{existing} is a file; give a folder for the results")
-    _check_permission(out, existing)
+    return existing
 
 
 def _check_permission(path, folder):
@@ -131,6 +134,7 @@ def replacing(path, *, overwrite=False):
     Parameters
     ----------
     path : str or path
+        Its folder is made, with its parents, if it does not exist.
     overwrite : bool
         Replace a file that exists.
 
@@ -144,7 +148,7 @@ def replacing(path, *, overwrite=False):
     path = Path(path)
     check_file(path, overwrite=overwrite)
     place = path.absolute()  # since asdf takes ~x for somebody's home
-    with locks.temporary_folder(place.parent, _PARTIAL) as folder:
+    with _made(place.parent), locks.temporary_folder(place.parent, _PARTIAL) as folder:
         temporary = folder / "file"  # since a long name would become too long
         with _written(temporary, path) as file:
             yield file

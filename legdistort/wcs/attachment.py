@@ -29,6 +29,7 @@ from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read
 from ..runtime.outputs import replacing, replacing_files, replacing_folder
 from ..runtime.progress import Bar
 from .fits_headers import header_error
+from .flux_cards import FluxCards
 from .footprints import former_wcs, renewed_footprint
 from .foreign_trees import model_wcs, refined_tree, table_of
 from .refinement import corner_move
@@ -119,7 +120,9 @@ def attach(
         Form of the header; None leaves it alone and adds the ASDF extension only. "head" leaves the frames alone, and
         writes the cards (TPV) of the images of each into a text ``NAME.head``, which SWarp and SCAMP read in the place
         of its headers: beside the frames, or into the folder `out` without them. With GAIN and SATURATE, which SWarp
-        reads, where the frames state them under other keywords.
+        reads, where the frames state them under other keywords, and with FLXSCALE, the factor that brings the values of
+        a frame to those of one of mean depth, where the fluxes of common stars join all exposures of the solution;
+        fluxes of lists must be in the unit of the pixels, as ``FLUX_AUTO`` is.
     max_error : float
         Largest error of the header, pixels.
     ext : int, str or (str, int), optional
@@ -179,6 +182,8 @@ def attach(
         )  # fmt: skip
     if not plans:
         raise InputError("none of the frames is part of the solution; give those it was made from")
+    if kind == "head":
+        images.fluxes.tell([images.views[name] for plan in plans for name in plan.headers])
     if kind in ("sip", "tpv"):
         header_texts.warn_of_texts([plan.path if in_place else plan.target for plan in plans])
     with replacing_files([plan.target for plan in plans]) if in_place else _copies(Path(out), overwrite) as writing:
@@ -211,13 +216,14 @@ def _unknown_sky(solution):
 class _Images:
     """Views of a solution by the names of images, and why others were left out; ``SOLSHA`` of its file.
 
-    And by how much each gwcs that is refined `moved` the corners of its image.
+    By how much each gwcs that is refined `moved` the corners of its image, and the `fluxes`.
     """
 
     views: dict
     left_out: dict
     checksum: str | None
     of_camera: bool
+    fluxes: FluxCards
     moved: dict = field(default_factory=dict)
 
     def of_file(self, name, header):
@@ -237,7 +243,7 @@ class _Images:
             ids = solution.camera.detectors
             left_out = {exposure_names.detector_name(name, k): why for name, why in left_out.items() for k in ids}
         views = {part.label: part for view in solution for part in view.parts}
-        return cls(views, left_out, solution.checksum, solution.camera.has_focal_plane)
+        return cls(views, left_out, solution.checksum, solution.camera.has_focal_plane, FluxCards(solution))
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,8 +327,8 @@ def _plan(known, path, target, *, kind, max_error, ext, overwrite):
                 planes = file_images.planes_beside(hdulist, hdulist[image])
                 for number in (image, *(_number(hdulist, plane) for plane in planes)):
                     if kind == "head":
-                        own = header_texts.detector_cards(hdulist, number) if number == image else fits.Header()
-                        of_images[number] = headers[name] + own
+                        own = header_texts.detector_cards(hdulist, number) + known.fluxes.of(known.views[name])
+                        of_images[number] = headers[name] + (own if number == image else fits.Header())
                         continue
                     start, data, stop, _ = spans[number]
                     footprint = renewed_footprint(known.views[name], hdulist, hdulist[number])

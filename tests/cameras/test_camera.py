@@ -16,6 +16,7 @@ from two_chips import two_chips_small
 import legdistort
 from legdistort.cameras import camera as cameras
 from legdistort.cameras import exchanged
+from legdistort.cameras.star_scales import flux_factors
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.geometry import models
@@ -47,6 +48,27 @@ def table(night):
 @pytest.fixture(scope="module")
 def solution(table, gsaoi):
     return legdistort.solve(legdistort.Matches.from_table(table, camera=gsaoi), degree=3)
+
+
+def test_fluxes_of_detectors_are_on_one_scale(gsaoi):
+    """Depths of exposures and sensitivities of detectors, as numpy puts them into counts, leave the fluxes of stars."""
+    rng, night = np.random.default_rng(1), gsaoi_images.Night(n_exposures=8, n_stars=400, dither=15.0)
+    table = night.table(sigma=SIGMA)
+    number = np.unique(np.asarray(table["exposure"]), return_inverse=True)[1]
+    ids, detector = np.unique(np.asarray(table["detector"]).astype(str), return_inverse=True)
+    depth, sensitive = np.exp(rng.normal(0, 0.5, number.max() + 1)), np.array([1.0, 1.1, 0.9, 1.05])
+    stars, star = np.unique(np.asarray(table["star"]), return_inverse=True)
+    true = 10 ** rng.uniform(3, 5, len(stars))
+    table["flux"] = depth[number] * sensitive[detector] * true[star] * np.exp(rng.normal(0, 0.01, len(table)))
+    solution = legdistort.solve(legdistort.Matches.from_table(table, camera=gsaoi), degree=3)
+    found = solution.stars
+    ratio = found["flux"] / true[np.searchsorted(stars, found["star"])]
+    np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=0.04)
+    factors = flux_factors(solution)
+    parts = [(i, k, view) for i, whole in enumerate(solution) for k, view in enumerate(whole.parts)]
+    product = [factors.of(view.name, view.detector) * depth[i] * sensitive[k] for i, k, view in parts]
+    assert [view.detector for _, _, view in parts[:4]] == ids.tolist()
+    np.testing.assert_allclose(product / np.median(product), 1, atol=0.005)
 
 
 def pixels(n=12, size=gsaoi_images.SIZE):

@@ -681,7 +681,11 @@ def test_files_that_cannot_be_written(line, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("in.fits", "other.fits", "other.ecsv"):
         (tmp_path / name).write_text("")
-    for name, words in ((old, f"{old} exists already"), ("", "is a folder"), ("none/m.fits", "none does not exist")):
+    for name, words in (
+        (old, f"{old} exists already"),
+        ("", "is a folder"),
+        (f"{old}/m.fits", "is a file; give a folder"),
+    ):
         failed(capsys, main(_ready(monkeypatch, line, read=tmp_path / "in.fits", out=tmp_path / name)), words)
     assert (tmp_path / old).read_text() == "precious"
     with pytest.raises(pytest.fail.Exception, match="the work began"):

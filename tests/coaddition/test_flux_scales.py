@@ -1,5 +1,7 @@
 """Flux scales, weights, support and saturation in co-adding, against what was put in."""
 
+import logging
+import re
 import warnings
 from dataclasses import replace
 from types import SimpleNamespace
@@ -97,13 +99,17 @@ class TestFluxScale:
         assert [factors[f.name] / factors["frame0-a"] for f in frames] == pytest.approx([1, 1, 0.5, 0.5])
 
     @pytest.mark.parametrize("scale", ["auto", "stars"])
-    def test_stars_through_clouds(self, scale):
+    def test_stars_through_clouds(self, scale, caplog):
         depth = np.array([1.0, 0.7, 0.9, 0.4, 1.1])
+        caplog.set_level(logging.INFO)
         factors, origin = flux_scales(blank(5, exposure_time=[60.0] * 5), scale, views(observed(depth)))
         assert origin == "stars"
         product = np.array([factors[f"frame{i}"] for i in range(5)]) * depth
         np.testing.assert_allclose(product / product.mean(), 1, atol=0.02)
         assert np.mean(list(factors.values())) == pytest.approx(1)  # the mean exposure time is kept
+        if scale == "auto":
+            low, high = re.search(r"stars have (\S+) to (\S+) of the light", caplog.text).groups()
+            np.testing.assert_allclose([float(low), float(high)], [0.4 / 0.9, 1.1 / 0.9], rtol=0.03)
 
     def test_time_is_preferred_where_stars_agree(self):
         times = [10.0, 20.0, 30.0]

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable, Table, vstack
-from deep_frames import artificial_inside, compared, deep_frames, excess, light
+from deep_frames import SIGMA, artificial_inside, compared, deep_frames, excess, light
+from scipy.ndimage import distance_transform_edt
 
 import legdistort as ld
 from legdistort.cli import main
@@ -201,6 +202,24 @@ def test_what_one_exposure_alone_shows_is_no_star():
     assert lone.tolist() == [False, True, False, False, False, False]
     assert varying.tolist() == [False, False, True, False, False, False]
     assert np.argwhere(spoiled).tolist() == [[6, 5]]
+
+
+def test_what_no_exposure_sees_has_no_row(truth, solution):
+    """A bright star beyond the stars that determined the maps, whose wings alone lie where they count."""
+    exposures, view = exposures_of(truth)[:1], solution["f00"]
+    shape = truth.frames[0].shape
+    pixels = np.stack(np.indices(shape)[::-1], axis=-1).reshape(-1, 2).astype(float)
+    away = distance_transform_edt(~view.supported(pixels).reshape(shape))
+    y, x = np.unravel_index(np.argmin(np.abs(away - 2 * 2.3548 * SIGMA)), shape)
+    columns, rows = (np.arange(max(c - 20, 0), min(c + 21, n)) for c, n in zip((x, y), shape[::-1], strict=True))
+    exposures[0].data[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += 3e5 * light((x, y), columns, rows)[0]
+    out = ld.catalogue(exposures, solution)
+    assert out.stars["n"].min() == 1
+    assert set(out.stars["star"]) == set(out.photometry["star"])
+    assert len(out.stars) > 20
+    place = view.correct([[float(x), float(y)]])
+    with pytest.raises(InputError, match="no exposure shows one of the positions"):
+        ld.catalogue(exposures, solution, positions=Table({"x": place[:, 0], "y": place[:, 1]}))
 
 
 def test_a_hit_on_a_faint_star_is_left_out(truth, solution, found):

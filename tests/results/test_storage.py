@@ -257,9 +257,12 @@ def test_a_failed_write_leaves_nothing(solution, tmp_path, monkeypatch, existing
     assert not existing or path.read_text() == "precious"
 
 
-def test_missing_folder_is_named(solution, tmp_path):
-    with pytest.raises(InputError, match=r"the folder .*nowhere does not exist; make it first"):
-        solution.write(tmp_path / "nowhere" / "s.asdf")
+def test_a_missing_folder_is_made(solution, tmp_path):
+    path = tmp_path / "new" / "below" / "s.asdf"
+    assert solution.write(path) == path
+    assert [each.name for each in path.parent.iterdir()] == ["s.asdf"]
+    with pytest.raises(InputError, match=r"s\.asdf is a file; give a folder"):
+        solution.write(path / "s.asdf")
 
 
 def test_absent_and_foreign_files(solution, tmp_path):

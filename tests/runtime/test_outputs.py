@@ -53,10 +53,20 @@ def test_refusals(tmp_path):
         pytest.fail("the block must not run")
     with pytest.raises(InputError, match="is a folder"), replacing(tmp_path, overwrite=True):
         pytest.fail("the block must not run")
-    with pytest.raises(InputError, match=r"the folder .*b does not exist"), replacing(tmp_path / "b" / "c"):
+    with pytest.raises(InputError, match="a is a file; give a folder"), replacing(tmp_path / "a" / "c"):
         pytest.fail("the block must not run")
     with pytest.raises(InputError, match="a is a file; give a folder"), replacing_folder(tmp_path / "a"):
         pytest.fail("the block must not run")
+
+
+def test_the_folder_of_a_file_is_made_and_goes_again_after_a_failure(tmp_path):
+    place = tmp_path / "b" / "below" / "c"
+    with pytest.raises(RuntimeError), replacing(place) as file:
+        half_written(file)
+    assert not names(tmp_path)
+    with replacing(place) as file:
+        file.write(b"new")
+    assert place.read_text() == "new"
 
 
 def test_permissions_are_those_of_any_new_file(tmp_path):
@@ -131,7 +141,7 @@ def test_files_and_folders_are_checked_beforehand(tmp_path):
     check_folder(tmp_path / "x" / "y")
     check_folder(tmp_path)
     assert names(tmp_path) == ["a"]
-    for bad, words in ((tmp_path / "a", "exists already"), (tmp_path, "is a folder"), (tmp_path / "b/c", "not exist")):
+    for bad, words in ((tmp_path / "a", "exists already"), (tmp_path, "is a folder"), (tmp_path / "a/c", "is a file")):
         with pytest.raises(InputError, match=words):
             check_file(bad)
     for bad in (tmp_path / "a", tmp_path / "a" / "b"):

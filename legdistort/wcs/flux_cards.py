@@ -1,0 +1,46 @@
+"""The card FLXSCALE of images, by which SWarp multiplies their values before it adds them."""
+
+import logging
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from astropy.io import fits
+
+from ..cameras.star_scales import FEW, flux_factors
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class FluxCards:
+    """FLXSCALE of the images of a solution: the factors by the fluxes of their common stars, where these tell them."""
+
+    solution: Any
+
+    @cached_property
+    def factors(self):
+        """`~legdistort.cameras.star_scales.FluxFactors`, or None."""
+        return flux_factors(self.solution)
+
+    def of(self, view):
+        """Header with the card of an image; empty where nothing tells it."""
+        if self.factors is None:
+            return fits.Header()
+        return fits.Header([("FLXSCALE", self.factors.of(view.name, view.detector), "by stars, to the mean depth")])
+
+    def tell(self, views):
+        """Say which factors the texts of some images have, or that they have none."""
+        if len(self.solution) < 2:
+            return
+        if self.factors is None:
+            log.warning(
+                "no FLXSCALE in the texts: the solution has no fluxes of %d common stars or more that join all "
+                "exposures; SWarp adds their values as they are, whatever exposure times and transparency", FEW,
+            )  # fmt: skip
+            return
+        scales = [self.factors.of(view.name, view.detector) for view in views]
+        log.info(
+            "FLXSCALE %.3g to %.3g by the fluxes of %d stars brings values to an exposure of mean depth; "
+            "SWarp leaves it out with -FSCALE_KEYWORD NONE", min(scales), max(scales), self.factors.n_stars,
+        )  # fmt: skip
