@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.io import fits
 from astropy.modeling import models
 from hypothesis import given, settings
@@ -340,3 +341,12 @@ def test_a_diagonal_one_is_the_widths():
         )
         for name in ("x", "y", "x_err", "x_err_abs"):
             assert_allclose(one[name].value, two[name].value, rtol=1e-6, atol=1e-9)
+
+
+def test_it_has_the_unit_of_a_square():
+    covariance = some_covariance()
+    assert_allclose(
+        Prior(np.zeros((2, 10)), static_covariance=covariance * u.pix**2).static_covariance, covariance, atol=1e-15
+    )
+    with pytest.raises(InputError, match="static_covariance"):
+        Prior(np.zeros((2, 10)), static_covariance=covariance * u.kg)

@@ -26,7 +26,7 @@ UNITS = {
     **dict.fromkeys(("motion", "motion_sigma"), (u.pix / u.yr,)),
     **dict.fromkeys(("epoch", "epochs", "motion_epoch", "date"), (u.yr,)),
     **dict.fromkeys(("saturation", "fluxes"), _COUNT),
-    "covariance": (u.pix**2,),
+    **dict.fromkeys(("covariance", "static_covariance", "layout_covariance"), (u.pix**2,)),
     "shift": (u.pix,),
     "rotation": (u.deg,),
     "gain": tuple(u.electron / each for each in _COUNT),
