@@ -13,7 +13,7 @@ from ..geometry.detector_modes import row_variances
 UNKNOWN = 100.0
 #: Error of what nothing is known of, where digits count [pix].
 FREE = 1e3
-_EXACT = 1e-12  # variance, of the largest, that is rounding
+_EXACT = 1e-15  # variance, of the largest, that is rounding
 _ROUNDING = 1e-9  # of the largest variance
 
 
