@@ -166,8 +166,8 @@ def read_exposures(
         Extension to read from every file; by default the image, ``SCI`` if one is named so. Planes beside it (``DQ``,
         ``WHT`` and the like) do not count. A name that several extensions have stands for all of them, the detectors of
         a camera: each becomes an `Exposure` ``NAME-ID`` with the ``exposure`` NAME and the ``detector`` ID, which is
-        ``CCDCHIP``, ``DETECTOR``, ``CHIP`` or ``EXTVER`` of its header. Images without a name are taken so by default
-        where each has an ``EXTVER`` and a ``DETSEC`` of its own, as in the raw files of Gemini.
+        ``CCDCHIP``, ``DETECTOR``, ``CHIP`` or ``EXTVER`` of its header, else ``FRAMEID``, ``CCDNAME`` or their order.
+        Images without a name are taken so by default where each has a ``DETSEC`` of its own, as in raw files of Gemini.
     dq_good : int, str or sequence of int, optional
         Flags of the DQ plane that are no reason to leave a pixel out, a sum of bits or ``"64,32"``; all others are.
     weight_maps : str, optional
@@ -419,19 +419,19 @@ def _parts(sources, ext):
     """``[(extension, id of the detector)]`` to read from every source; None where it is not one of several."""
     if not (ext is None or isinstance(ext, str)):
         return [[(ext, None)] for _ in sources]
-    parts = images_of_detectors([_headers_of_images(source) for source in sources], ext)
+    parts = images_of_detectors([_headers_of(source) for source in sources], ext)
     if ext is None and (most := max(map(len, parts))) > 1:
         log.info("%d images without a name in a file are taken for the detectors of one camera, by DETSEC", most)
     return parts
 
 
-def _headers_of_images(source):
-    """The images of a FITS file, or none of what cannot be read: the error comes when it is read."""
+def _headers_of(source):
+    """The HDUs of a FITS file, or none of what cannot be read: the error comes when it is read."""
     if isinstance(source, fits.HDUList):
-        return [hdu for hdu in source if is_image(hdu)]
+        return list(source)
     try:
         with _quiet(), _opened(Path(source)) as hdulist:
-            return [hdu for hdu in hdulist if is_image(hdu)]
+            return list(hdulist)
     except (InputError, TypeError):
         return []
 

@@ -259,6 +259,7 @@ def solve(
     catalogue, epoch = check_tie(matches, asked, reference, **tying)
     if model is None:
         _warn_of_header(matches, prior)
+        _tell_of_degree(degree, prior)
     is_prior = matches.camera.has_focal_plane or static in ("hold", "prior")  # of the camera, or the prior, by now
     options, form = replace(asked, static=None, layout=None) if is_prior else asked, None
     if model is not None:
@@ -283,6 +284,17 @@ def solve(
     if sought is not None:
         kept_out = solution.camera.in_focal_plane(matches.camera.on_detectors(kept_out))
     return replace(solution, diagnostics=replace(found, validation=validation(solution, kept_out, validate)))
+
+
+def _tell_of_degree(degree, prior):
+    """Say what the default of the degree leaves of a prior of a higher one."""
+    each = prior.values() if isinstance(prior, dict) else [prior]
+    highest = max((p.degree for p in each if p is not None and p.states_mean), default=0)
+    if isinstance(degree, Unasked) and highest > degree:
+        log.info(
+            "exposures are fitted to degree %d, the default: what the prior has beyond, up to degree %d, is held as "
+            "given; degree=%d (--degree %d) fits that too", degree, highest, highest, highest,
+        )  # fmt: skip
 
 
 def solution_of(fit, asked, **settings):
