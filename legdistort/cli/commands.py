@@ -367,11 +367,13 @@ def do_show(a):
 
 def do_nights(a):
     """``legdistort nights``."""
-    words = given(a, options.NIGHTS) | {"progress": wants_progress(a)}
+    words = given(a, options.NIGHTS) | {"results": [each.rstrip("/") or each for each in a.results]}
+    words["progress"] = wants_progress(a)
     found = legdistort.combine_nights(**words, workers=a.workers or min(parallel.n_cores(), len(a.results)))
     found.write(a.out, date=a.date, overwrite=a.overwrite)
     _draw(found, a)
-    _say(a, found, found.to_dict(a.date))
+    at = "" if a.date is None else f"\n\nThe camera in {a.out} is that of {a.date:g}."
+    _say(a, f"{found}{at}", found.to_dict(a.date))
     return 3 if a.strict and found.odd else 0
 
 

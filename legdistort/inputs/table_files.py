@@ -21,7 +21,10 @@ from .star_lists import dialects, formats
 log = logging.getLogger(__name__)
 
 #: Formats that are written, by suffix.
-WRITTEN = {".ecsv": "ascii.ecsv", ".fits": "fits", ".csv": "ascii.csv", ".vot": "votable", ".xml": "votable"}
+WRITTEN = {
+    ".ecsv": "ascii.ecsv", ".fits": "fits", ".csv": "ascii.csv", ".txt": "ascii.basic", ".dat": "ascii.basic",
+    ".vot": "votable", ".xml": "votable",
+}  # fmt: skip
 
 
 def read_table(path, *, columns=None, origin=None, error=None):
@@ -265,7 +268,7 @@ def _fill_errors(table, error):
 
 
 def write_stars(solution, path, *, epoch=None, overwrite=False):
-    """Write the stars of a solution as ECSV, FITS, VOTable or CSV, by the suffix.
+    """Write the stars of a solution as ECSV, FITS, VOTable, CSV or plain text, by the suffix.
 
     Names, units and UCDs follow the Virtual Observatory (`legdistort.inputs.column_contract.STARS`).
 
@@ -273,7 +276,7 @@ def write_stars(solution, path, *, epoch=None, overwrite=False):
     ----------
     solution : Solution
     path : str or path
-        Ending in ``.ecsv``, ``.fits``, ``.vot``, ``.xml`` or ``.csv`` (without units).
+        Ending in ``.ecsv``, ``.fits``, ``.vot``, ``.xml``, or without units ``.csv``, ``.txt``, ``.dat``.
     epoch : float or `~astropy.time.Time`, optional
         Where they are at this time instead: `Solution.stars_at`.
     overwrite : bool
