@@ -272,6 +272,12 @@ def shown_by(solution, label, other=None):
     if len(shapes) > 1:
         raise InputError(f"{label} has detectors of several shapes, {sorted(shapes)}: it gives no single map")
     shape, matches = shapes.pop(), _at_errors_in_force(solution)
+    if len(matches.names) < 2:
+        raise InputError(
+            f"{label} has one exposure, {matches.names[0]}, which alone does not tell the static distortion from its "
+            "own departure: bring it into a night of others, solve(new, base=night) (legdistort solve TABLE --base "
+            "NIGHT), and give what that finds"
+        )
     degree, n = solution.degree, basis.n_modes(solution.degree)
     around = solution.coefficients[:, :, :n].mean(axis=0) if other is None else basis.change_degree(other, degree)
     around, rows = pointed(around, shape), detector_modes.dynamic_basis(shape, n)

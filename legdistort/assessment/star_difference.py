@@ -23,6 +23,7 @@ from ..results import in_tables
 #: Stars that are named, those that differ most.
 NAMED = 5
 _FEWEST = 5  # stars in both
+_SAME_SEASON = 0.1  # years, in which a star of 5 mas/yr moves by 0.5 mas
 _SAME_PLACE, _SAME_TIME = 0.5, 1e-5  # of the stars of an exposure that was measured twice [pix], [yr]
 
 
@@ -37,7 +38,7 @@ class Offsets:
     rms, ratio : float
         After a common map of the degree; over relative errors.
     p : float
-        Probability of so large a ratio by chance; NaN where exposures are shared.
+        Probability of so large a ratio by chance; NaN where exposures are shared, or stars moved unknown.
     """
 
     rms_similarity: float
@@ -79,6 +80,9 @@ class StarDifference:
         Julian year of the places.
     pixel_scale : float or None
         Arcsec, as stated of the first.
+    years : float
+        Between the two where motions do not carry the stars from one to the other, else 0: they moved by these years of
+        their motions, which no error has.
     """
 
     table: QTable
@@ -88,6 +92,7 @@ class StarDifference:
     degree: int
     epoch: float | None
     pixel_scale: float | None = None
+    years: float = 0.0
 
     def lines(self) -> list[str]:
         """What `print` shows of them."""
@@ -103,7 +108,14 @@ class StarDifference:
                 figures = [f"{self.angles[f'motions_{kind}']:.2g}" for kind in ("similarity_mas_yr", "mas_yr")]
                 out[-1] += f", motions {' and '.join(figures)} mas/yr"
             out[-1] += "."
-        if np.isnan(self.places.p):
+        if self.years:
+            when = "later" if self.years > 0 else "earlier"
+            out.append(
+                f"The second is {abs(self.years):.2f} years {when}, and neither has motions: the stars moved by these "
+                "years of them, which no error has, and chances are not known; solve both together, motion='proper' "
+                "(--motion proper), for what they are."
+            )
+        elif np.isnan(self.places.p):
             out.append("Exposures are in both: errors are the larger of the two, and chances are not known.")
         worst = self.table[:NAMED].copy()
         for name in worst.colnames[1:]:
@@ -137,6 +149,7 @@ class StarDifference:
         more = {
             "degree": self.degree,
             "epoch_yr": self.epoch,
+            "unmoved_yr": self.years,
             "angles": self.angles,
             "largest": records(self.table[:NAMED]),
         }
@@ -173,7 +186,7 @@ def compare_stars(first, second, *, shared):
     shared : bool
         Whether they have exposures in common, so that their errors are not independent.
     """
-    one, two, year = _at_one_time(first, second)
+    one, two, year, years = _at_one_time(first, second)
     counts = len(one), len(two)
     try:
         rows = same_stars(_places(one), _places(two), "the second solution")
@@ -198,7 +211,7 @@ def compare_stars(first, second, *, shared):
     found = []
     for values, name in ((places, "{}"), (motions, "v{}")) if moving else ((places, "{}"),):
         errors = [_together(one, two, f"{name}_{kind}", shared) for kind in ("err", "err_abs")]
-        left, offsets = _offsets(values, xy, field, errors, degree, shared)
+        left, offsets = _offsets(values, xy, field, errors, degree, by_chance=not (shared or years))
         found.append(offsets)
         prefix, unit = name.format("")[:1], one[name.format("x")].unit
         for axis in range(2):
@@ -207,18 +220,20 @@ def compare_stars(first, second, *, shared):
         table[f"{prefix}_ratio".lstrip("_")] = np.sqrt(np.mean(left**2, axis=1)) / errors[0]
     table = table[np.argsort(-table["ratio"])]
     scale = in_tables.pixel_scale(first)
-    return StarDifference(table, found[0], found[1] if moving else None, counts, degree, year, scale)
+    return StarDifference(table, found[0], found[1] if moving else None, counts, degree, year, scale, years)
 
 
 def _at_one_time(first, second):
-    """The stars of both at the epoch of the first, as far as motions are known, and that epoch."""
-    one, two = first.stars, second.stars
+    """The stars of both at the epoch of the first, as far as motions are known, that epoch, and the years beyond."""
+    one, two, years = first.stars, second.stars, 0.0
     year, other = in_tables.epoch(first), in_tables.epoch(second)
     if year is not None and second.estimate.motions is not None:
         two = second.stars_at(year)
     elif other is not None and first.estimate.motions is not None:
         one, year = first.stars_at(other), other
-    return one, two, year
+    elif None not in (year, other) and first.estimate.motions is None and abs(other - year) > _SAME_SEASON:
+        years = other - year
+    return one, two, year, years
 
 
 def _placed(stars):
@@ -231,7 +246,7 @@ def _places(stars):
     return np.asarray(stars["star"]), _xy(stars), np.asarray(stars["flux"]) if "flux" in stars.colnames else None
 
 
-def _offsets(values, xy, field, errors, degree, shared):
+def _offsets(values, xy, field, errors, degree, *, by_chance):
     """Values (n, 2) without a common map of every field, and their `Offsets`; errors (n,) relative and absolute."""
     alike, left = np.empty_like(values), np.empty_like(values)
     for each in np.unique(field):
@@ -246,7 +261,7 @@ def _offsets(values, xy, field, errors, degree, shared):
         ratio_similarity=_rms(alike[known] / errors[1][known, None]),
         rms=_rms(left[known]),
         ratio=ratio,
-        p=float(special.chdtrc(dof, dof * ratio**2)) if dof > 0 and not shared else np.nan,
+        p=float(special.chdtrc(dof, dof * ratio**2)) if dof > 0 and by_chance else np.nan,
     )
 
 

@@ -16,9 +16,8 @@ from ..coaddition.options import CoaddOptions
 from ..exceptions import InputError
 from ..inputs import column_contract
 from ..inputs.detector_files import warn_of_detectors
-from ..inputs.exposure_names import detector_name
 from ..inputs.star_lists.formats import stack
-from ..inputs.table_files import named_after, records, write_stars
+from ..inputs.table_files import named_after, named_as_known, names_of_images, records, told_apart, write_stars
 from ..priors.prior import EVIDENCE, HEADER, UNSTATED, HeaderPrior
 from ..results.check import WRONG, Check, worst
 from ..runtime import outputs, parallel, provenance
@@ -155,7 +154,7 @@ def do_match(a):
     from ..pipeline import timed, write_matched
 
     contract = column_contract.DETECTED | {name: column_contract.MATCHED[name] for name in ("epoch", "block")}
-    read = {Path(path): read_given(path, a, contract) for path in a.tables}
+    read = told_apart([(Path(path), read_given(path, a, contract)) for path in a.tables])
     if a.wcs is None:
         refuse({"ext": a.ext}, "is for the frames of --wcs")
         exposures = None
@@ -165,10 +164,7 @@ def do_match(a):
     tables = list(read.values())
     if not any(map(len, tables)):
         column_contract.check(tables[0], contract, str(a.tables[0]))
-    names = [name for table in tables for name in _parts(table)]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
+    names = names_of_images(read)
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
     camera = given_camera(a.camera) or _measured_with(tables)
     if camera:
@@ -371,11 +367,13 @@ def do_show(a):
 
 def do_nights(a):
     """``legdistort nights``."""
-    words = given(a, options.NIGHTS) | {"progress": wants_progress(a)}
+    words = given(a, options.NIGHTS) | {"results": [each.rstrip("/") or each for each in a.results]}
+    words["progress"] = wants_progress(a)
     found = legdistort.combine_nights(**words, workers=a.workers or min(parallel.n_cores(), len(a.results)))
     found.write(a.out, date=a.date, overwrite=a.overwrite)
     _draw(found, a)
-    _say(a, found, found.to_dict(a.date))
+    at = "" if a.date is None else f"\n\nThe camera in {a.out} is that of {a.date:g}."
+    _say(a, f"{found}{at}", found.to_dict(a.date))
     return 3 if a.strict and found.odd else 0
 
 
@@ -400,7 +398,9 @@ def do_correct(a):
     """``legdistort correct``."""
     from ..inputs.table_files import write_by_ending
 
-    table = _solution(a).correct_table(read_given(a.table, a), epoch=a.epoch)
+    solution = _solution(a)
+    table = named_as_known(read_given(a.table, a), a.table, solution.names)
+    table = solution.correct_table(table, epoch=a.epoch)
     write_by_ending(table, a.out, overwrite=a.overwrite)
     _say(a, f"{len(table)} positions in {a.out}", {"n_positions": len(table), "out": str(a.out)})
 
@@ -494,13 +494,6 @@ def _solving(a, matches=None):
         degree = 0 if sigma == EVIDENCE else HIGHEST if a.degree == AUTO else keywords.get("degree", DEGREE)
         prior = (prior or legdistort.Prior([[0.0], [0.0]], source=UNSTATED)).with_sigma(sigma, degree=degree)
     return keywords | {"prior": prior}
-
-
-def _parts(table):
-    """Names of the exposures in a table, or of the parts of them that single detectors took."""
-    if "detector" not in table.colnames:
-        return list(dict.fromkeys(table["exposure"]))
-    return list(dict.fromkeys(detector_name(*pair) for pair in zip(table["exposure"], table["detector"], strict=True)))
 
 
 def _measured_with(tables):

@@ -188,7 +188,7 @@ COMMANDS = {
         "the stars of a solution as a table",
         "results/solution.asdf --out stars.fits",
         options.SOLUTION,
-        options.out("table (.ecsv, .fits, .vot, .xml or .csv)"),
+        options.out("table (.ecsv, .fits, .vot, .xml, .csv, .txt or .dat)"),
         options.AT_EPOCH,
     ),
     "correct": _command(
@@ -196,7 +196,7 @@ COMMANDS = {
         "results/solution.asdf faint.ecsv --out corrected.ecsv",
         options.SOLUTION,
         options.POSITIONS,
-        options.out("table (.ecsv, .fits, .vot, .xml or .csv)"),
+        options.out("table (.ecsv, .fits, .vot, .xml, .csv, .txt or .dat)"),
         options.COLUMNS,
         options.CARRIED,
     ),

@@ -34,7 +34,7 @@ from ..runtime.progress import Bar
 from ..runtime.provenance import checksum, unchanged
 from . import repetitions
 from .detector_files import with_detectors
-from .exposure_names import detector_name, exposure_name
+from .exposure_names import detector_name, exposure_name, file_names, folder_marks, folders_in_words, marked
 from .exposures import LEAVE_OUT, Exposure
 from .file_images import as_plane, find_image, images_of_detectors, is_image, of_detector, weight_number
 from .fits_images import from_hdulist, planes_of, told_as_damaged, with_weights, with_weights_stated
@@ -148,7 +148,8 @@ def read_exposures(
 
     The name of an exposure is the base name of its file without ``.fits``, ``.fit``, ``.fts`` and
     ``.gz``, ``.fz``, plus ``_EXT`` if `ext` was given. Images without a file are named after the
-    ``FILENAME`` in their header, or ``exposure_0``, ``exposure_1`` by their place in the list.
+    ``FILENAME`` in their header, or ``exposure_0``, ``exposure_1`` by their place in the list. Where names repeat in
+    several folders, the names of these come before all of them, ``FOLDER_NAME``.
 
     Extensions ``ERR``, ``UNCERT``, ``VAR`` or ``VARIANCE`` and ``DQ`` or ``MASK`` with the shape and the
     ``EXTVER`` of the image are used as its uncertainty and mask (any non-zero value is bad; of JWST
@@ -165,8 +166,8 @@ def read_exposures(
         Extension to read from every file; by default the image, ``SCI`` if one is named so. Planes beside it (``DQ``,
         ``WHT`` and the like) do not count. A name that several extensions have stands for all of them, the detectors of
         a camera: each becomes an `Exposure` ``NAME-ID`` with the ``exposure`` NAME and the ``detector`` ID, which is
-        ``CCDCHIP``, ``DETECTOR``, ``CHIP`` or ``EXTVER`` of its header. Images without a name are taken so by default
-        where each has an ``EXTVER`` and a ``DETSEC`` of its own, as in the raw files of Gemini.
+        ``CCDCHIP``, ``DETECTOR``, ``CHIP`` or ``EXTVER`` of its header, else ``FRAMEID``, ``CCDNAME`` or their order.
+        Images without a name are taken so by default where each has a ``DETSEC`` of its own, as in raw files of Gemini.
     dq_good : int, str or sequence of int, optional
         Flags of the DQ plane that are no reason to leave a pixel out, a sum of bits or ``"64,32"``; all others are.
     weight_maps : str, optional
@@ -284,7 +285,7 @@ def _read_each(paths, read, ext, maps, progress, bad=None, copies=None):
     What cannot be used is an error, or goes into the dict `bad`: ``{name: (file, reason, error)}``. An image that is
     there already goes into the dict `copies`, if there is one: ``{name: reason}``.
     """
-    origins, exposures, images = {}, [], {}
+    exposures, images = [], {}
     sources = maps.frames_of(expand_paths(paths))
     parts = _parts(sources, ext)
     bar = Bar(total=sum(map(len, parts)), desc="reading", unit="frame", disable=not progress)
@@ -303,23 +304,43 @@ def _read_each(paths, read, ext, maps, progress, bad=None, copies=None):
                 reason = str(error).removeprefix(f"{sources[i]}: ").removeprefix(f"{name}: ").removesuffix(LEAVE_OUT)
                 bad[name] = file, reason, error
                 continue
-            origin = exposure.path if exposure.path is not None else "in memory"
             if copies is not None:
                 first = images.setdefault(_pixels(exposure), exposure)
                 if first is not exposure:
-                    where = f" ({origins[first.name]} and {origin})" * (first.name == exposure.name)
+                    where = f" ({_origin(first)} and {_origin(exposure)})" * (first.name == exposure.name)
                     copies[exposure.name] = f"its pixels are those of {first.name}{where}"
                     continue
-            if exposure.name in origins:
-                raise InputError(
-                    f"two exposures are named {exposure.name!r} ({origins[exposure.name]} and "
-                    f"{origin}); rename a file: exposures are distinguished by their names"
-                )
-            origins[exposure.name] = origin
             exposures.append(exposure)
+    exposures = told_apart(exposures)
     _warn_of_doubts(exposures)
     _tell_weight_maps(sources, maps)
     return with_detectors(exposures)
+
+
+def told_apart(exposures):
+    """Exposures with names that differ, those of one name by the folders of their files.
+
+    Raises
+    ------
+    InputError
+        Naming two of one name that no folder tells apart.
+    """
+    marks = folder_marks([each.name for each in exposures], [each.path for each in exposures])
+    if any(marks):
+        log.info("%s", folders_in_words(marks[0] + exposures[0].name))
+    exposures, seen = list(map(marked, exposures, marks)), {}
+    for each in exposures:
+        first = seen.setdefault(each.name, each)
+        if first is not each:
+            raise InputError(
+                f"two exposures are named {each.name!r} ({_origin(first)} and {_origin(each)}); rename a file, or "
+                "give one of them: exposures are distinguished by their names"
+            )
+    return exposures
+
+
+def _origin(exposure):
+    return "in memory" if exposure.path is None else exposure.path
 
 
 def _tell_weight_maps(sources, maps):
@@ -351,10 +372,14 @@ def _one_after_another(sources, parts, maps):
 
 
 def file_checksums(exposures):
-    """``{base name: SHA-256}`` of the files of exposures that `open_exposures` gave, maps too; others have none."""
+    """``{base name: SHA-256}`` of the files of exposures that `open_exposures` gave, maps too; others have none.
+
+    Where base names repeat in several folders, these come before them.
+    """
     files = [exposure for exposure in exposures if isinstance(exposure, ExposureFile)]
     files += [exposure.weights for exposure in files if exposure.weights is not None]
-    return {each.path.name: each.checksum for each in files}
+    found = {each.path: each.checksum for each in files}
+    return dict(zip(file_names(list(found)), found.values(), strict=True))
 
 
 def listed(exposures, function):
@@ -394,19 +419,19 @@ def _parts(sources, ext):
     """``[(extension, id of the detector)]`` to read from every source; None where it is not one of several."""
     if not (ext is None or isinstance(ext, str)):
         return [[(ext, None)] for _ in sources]
-    parts = images_of_detectors([_headers_of_images(source) for source in sources], ext)
+    parts = images_of_detectors([_headers_of(source) for source in sources], ext)
     if ext is None and (most := max(map(len, parts))) > 1:
         log.info("%d images without a name in a file are taken for the detectors of one camera, by DETSEC", most)
     return parts
 
 
-def _headers_of_images(source):
-    """The images of a FITS file, or none of what cannot be read: the error comes when it is read."""
+def _headers_of(source):
+    """The HDUs of a FITS file, or none of what cannot be read: the error comes when it is read."""
     if isinstance(source, fits.HDUList):
-        return [hdu for hdu in source if is_image(hdu)]
+        return list(source)
     try:
         with _quiet(), _opened(Path(source)) as hdulist:
-            return [hdu for hdu in hdulist if is_image(hdu)]
+            return list(hdulist)
     except (InputError, TypeError):
         return []
 

@@ -1,6 +1,8 @@
 """Names of exposures: from those of their files, and fit to be those of other files."""
 
+import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from ..exceptions import InputError
@@ -17,6 +19,66 @@ def exposure_name(path, ext=None):
     name = _SUFFIX.sub("", Path(path).name)
     parts = ext if isinstance(ext, tuple) else (ext,)
     return name if ext is None else f"{name}_{''.join(map(str, parts))}"
+
+
+def folder_marks(names, paths):
+    """What comes before names of files in several folders so that those of one name differ: ``FOLDER_``.
+
+    Of all files the folder on the same level, the lowest that serves: the numbers of frames begin anew in every night.
+
+    Parameters
+    ----------
+    names : sequence of str
+    paths : sequence of Path or None
+        The file that each comes from; several of one file have different names.
+
+    Returns
+    -------
+    list of str
+        Empty texts where the names differ as they are, or no folder tells them apart.
+    """
+    folders = [(None if path is None else Path(os.path.abspath(path)).parents) for path in paths]
+    plain = [""] * len(names)
+    if len(set(names)) == len(names):
+        return plain
+    for level in range(max(0 if each is None else len(each) for each in folders)):
+        marks = ["" if each is None or level >= len(each) else f"{each[level].name}_" for each in folders]
+        if len(set(zip(marks, names, strict=True))) == len(names):
+            return marks
+    return plain
+
+
+def file_names(paths):
+    """Base names of files, with folders before them where they repeat (`folder_marks`)."""
+    names = [path.name for path in paths]
+    return [mark + name for mark, name in zip(folder_marks(names, paths), names, strict=True)]
+
+
+def folders_in_words(name):
+    """What is said where names have a folder before them (`folder_marks`), with the first of them."""
+    return f"names of files repeat in several folders, whose names are put before them: {name} and so on"
+
+
+def folder_mark(name, path, known):
+    """``FOLDER_`` of a file, one of its folders, with which its name is the beginning of a known one; else empty.
+
+    Parameters
+    ----------
+    name : str
+        As the file is called by itself.
+    path : Path
+    known : iterable of str
+        Names of exposures, see `folder_marks`.
+    """
+    marks = ["", *(f"{folder.name}_" for folder in Path(os.path.abspath(path)).parents)]
+    begins = (mark for mark in marks for each in known if re.match(rf"{re.escape(mark + name)}(?![A-Za-z0-9])", each))
+    return next(begins, "")
+
+
+def marked(image, mark):
+    """An exposure, or the part of one, with something before its name."""
+    whole = {} if image.exposure is None else {"exposure": mark + image.exposure}
+    return replace(image, name=mark + image.name, **whole) if mark else image
 
 
 def alike(name, names):

@@ -11,6 +11,8 @@ from .exposure_names import detector_name, exposure_name, in_header
 
 #: Header keywords that distinguish detectors, in order of preference.
 KEYWORDS = ("CCDCHIP", "DETECTOR", "CHIP", "EXTVER", "EXTNAME")
+#: The same and those by which images of one file are told apart where no other does, as in frames of Gemini.
+_OF_ONE_FILE = *KEYWORDS, "FRAMEID", "CCDNAME"
 #: Words in the names of extensions that are no images of the sky but stand beside one: errors, masks, weights, times,
 #: backgrounds, and the look-up tables of a WCS, as the archives of HST, JWST, ESO, NOIRLab and Astropy name them.
 _BESIDE = {
@@ -24,16 +26,40 @@ _BESIDE = {
 _MOST_NAMED = 8
 
 
-def detector_ids(headers):
+def _numbered(hdulist):
+    """``{number: HDU}`` of the images of a file, a sequence of HDUs."""
+    return {i: hdu for i, hdu in enumerate(hdulist) if is_image(hdu)}
+
+
+def _named(images, ext):
+    """Those of ``{number: HDU}`` with the name asked for."""
+    return {i: hdu for i, hdu in images.items() if isinstance(ext, str) and hdu.name == ext.strip().upper()}
+
+
+def _forms(named):
+    """``{number: extension}`` of images of one name: by name and ``EXTVER``, or by number where these repeat."""
+    distinct = len({hdu.ver for hdu in named.values()}) == len(named)
+    return {i: (hdu.name, hdu.ver) if distinct else i for i, hdu in named.items()}
+
+
+def detector_ids(headers, keywords=KEYWORDS):
     """Ids of the detectors of one exposure by the first keyword that all headers have with values of their own.
 
     None if there is no such keyword.
     """
-    for keyword in KEYWORDS:
+    for keyword in keywords:
         values = [header.get(keyword) for header in headers]
         if None not in values and len(set(values)) == len(values):
             return [str(value).strip() for value in values]
     return None
+
+
+def _parts(named):
+    """``[(extension, id)]`` of several images ``{number: HDU}`` of one name; by their order where nothing has ids."""
+    forms = _forms(named)
+    versions = [form[1] if isinstance(form, tuple) else k for k, form in enumerate(forms.values(), 1)]
+    ids = detector_ids([hdu.header for hdu in named.values()], _OF_ONE_FILE) or list(map(str, versions))
+    return list(zip(forms.values(), ids, strict=True))
 
 
 def images_of_detectors(files, ext):
@@ -42,7 +68,7 @@ def images_of_detectors(files, ext):
     Parameters
     ----------
     files : list of list of HDU
-        The images of every file.
+        All of every file.
     ext : int, str, (str, int) or None
         The extension asked for; a name may stand for the images of several detectors, and none for those that have no
         name but each a place in one array of detectors (`are_unnamed_detectors`).
@@ -52,53 +78,48 @@ def images_of_detectors(files, ext):
     list of list
         ``[(extension, id)]`` for every file; the id is None where it has but one image and no other file has several.
     """
-    single = [[(ext, None)] for _ in files]
-    if ext is None and any(map(are_unnamed_detectors, files)):
+    single, files = [[(ext, None)] for _ in files], list(map(_numbered, files))
+    if ext is None and any(are_unnamed_detectors(list(images.values())) for images in files):
         ext = ""
     if not isinstance(ext, str):
         return single
-    named = [[hdu for hdu in images if hdu.name == ext.strip().upper()] for images in files]
     found, known = [], set()
-    for each in named:
-        versions = [hdu.ver for hdu in each]
-        several = len(set(versions)) == len(each) > 1
-        ids = (detector_ids([hdu.header for hdu in each]) or list(map(str, versions))) if several else []
-        found.append([((ext, version), key) for version, key in zip(versions, ids, strict=False)])
-        known |= set(ids)
+    for images in files:
+        named = _named(images, ext)
+        found.append(_parts(named) if len(named) > 1 else [])
+        known |= {key for _, key in found[-1]}
     for k, images in enumerate(files):
-        if len(named[k]) == 1:  # an exposure that lacks the other detectors
-            found[k] = [part for part in every_id(images, ext) if part[1] in known][:1]
+        if len(_named(images, ext)) == 1:  # an exposure that lacks the other detectors
+            found[k] = [part for part in _every_id(images, ext) if part[1] in known][:1]
     return [parts or one for parts, one in zip(found, single, strict=True)]
 
 
 def are_unnamed_detectors(images):
     """Whether images are the detectors of one camera as Gemini writes them: no names, but each a place of its own.
 
-    They are alike but for ``EXTVER`` and the section of the array, ``DETSEC``; the amplifiers of one detector, which
-    have a section each too, share its ``CCDNAME``.
+    They are alike but for the section of the array, ``DETSEC``, and ``EXTVER``, where they have it; the amplifiers of
+    one detector, which have a section each too, share its ``CCDNAME``.
     """
-    alike = len({plane_shape(hdu) for hdu in images}) == 1 and {hdu.name for hdu in images} == {""}
-    if not alike or not _are_versions(images):
+    if len(images) < 2 or len({plane_shape(hdu) for hdu in images}) > 1 or {hdu.name for hdu in images} != {""}:
         return False
     sections, chips = ([hdu.header.get(key) for hdu in images] for key in ("DETSEC", "CCDNAME"))
     return None not in sections and all(len(set(each)) == len(images) or each[0] is None for each in (sections, chips))
 
 
-def _are_versions(images):
-    """Whether several images have one name, or none, and an ``EXTVER`` each."""
-    return len({hdu.name for hdu in images}) == 1 < len({hdu.ver for hdu in images}) == len(images)
-
-
-def every_id(images, ext):
-    """``[(extension, id)]`` of the images of that extension name, with each id that a detector may have."""
-    named = [hdu for hdu in images if isinstance(ext, str) and hdu.name == ext.strip().upper()]
-    values = [((ext, hdu.ver), str(hdu.header.get(keyword, "")).strip()) for keyword in KEYWORDS for hdu in named]
+def _every_id(images, ext):
+    """``[(extension, id)]`` of the images ``{number: HDU}`` of that name, with each id that a detector may have."""
+    named = _named(images, ext)
+    forms = _forms(named)
+    values = [
+        (forms[i], str(hdu.header.get(keyword, "")).strip()) for keyword in _OF_ONE_FILE for i, hdu in named.items()
+    ]
     return [part for part in values if part[1]]
 
 
 def of_detector(exposure, ext, key):
     """An exposure that was read from one of several images of a file, named after its detector."""
-    whole = exposure.name.removesuffix(f"_{''.join(map(str, ext))}")
+    parts = ext if isinstance(ext, tuple) else (ext,)
+    whole = exposure.name.removesuffix(f"_{''.join(map(str, parts))}")
     return replace(exposure, name=detector_name(whole, key), exposure=whole, detector=key)
 
 
@@ -113,10 +134,10 @@ def extension_names(hdulist, path):
 
 def detector_names(hdulist, path, ext=None):
     """``{name of an exposure: extension}`` for every way to name the detectors of a file, of one extension or all."""
-    images = [hdu for hdu in hdulist if is_image(hdu) and not _stands_beside(hdu.name)]
-    kinds = {hdu.name for hdu in images} if ext is None else {ext}
-    forms = [part for kind in kinds for part in every_id(images, kind)]
-    return {detector_name(exposure_name(path), key): form for form, key in forms}
+    images = {i: hdu for i, hdu in _numbered(hdulist).items() if not _stands_beside(hdu.name)}
+    kinds = {hdu.name for hdu in images.values()} if ext is None else {ext}
+    forms = [part for kind in kinds for part in _every_id(images, kind) + _parts(_named(images, kind))]
+    return {detector_name(exposure_name(path), key): form for form, key in forms}  # the last, as they are read
 
 
 def named_images(hdulist, path):
@@ -240,7 +261,7 @@ def _listed_images(hdulist, images):
     python = f"({name!r}, {version})" if comma else name
     listed_so = f"{len(images)} images, {', '.join(named)}{more} (ny, nx)"
     advice = f"choose one, such as ext={python} (--ext {forms[0]})"
-    if _are_versions(images):
+    if len({hdu.name for hdu in images}) == 1:
         every = images[0].name
         advice += f", or take all as the detectors of one camera, ext={every!r} (--ext {every or repr(every)})"
     return f"{listed_so}: {advice}"

@@ -21,7 +21,10 @@ from .star_lists import dialects, formats
 log = logging.getLogger(__name__)
 
 #: Formats that are written, by suffix.
-WRITTEN = {".ecsv": "ascii.ecsv", ".fits": "fits", ".csv": "ascii.csv", ".vot": "votable", ".xml": "votable"}
+WRITTEN = {
+    ".ecsv": "ascii.ecsv", ".fits": "fits", ".csv": "ascii.csv", ".txt": "ascii.basic", ".dat": "ascii.basic",
+    ".vot": "votable", ".xml": "votable",
+}  # fmt: skip
 
 
 def read_table(path, *, columns=None, origin=None, error=None):
@@ -110,6 +113,104 @@ def named_after(table, exposures, path):
     return out
 
 
+def told_apart(tables):
+    """Tables of files with exposures whose names differ: those called as their files, by the folders of these.
+
+    Parameters
+    ----------
+    tables : list of (Path, Table)
+        As `read_table` gives them.
+
+    Returns
+    -------
+    dict of Path to Table
+
+    Raises
+    ------
+    InputError
+        For a file that stands twice, naming it both ways.
+    """
+    real = {}
+    for path, _ in tables:
+        if (first := real.setdefault(path.resolve(), path)) is not path:
+            raise InputError(f"{first} and {path} are one file: give it once")
+    of_file = [path for path, table in tables if _is_of_file(table)]
+    names = list(map(_name_of, of_file))
+    marks = dict(zip(of_file, exposure_names.folder_marks(names, of_file), strict=True))
+    if any(marks.values()):
+        log.info("%s", exposure_names.folders_in_words(marks[of_file[0]] + names[0]))
+    return {path: with_mark(table, marks.get(path), path) for path, table in tables}
+
+
+def names_of_images(tables):
+    """Names of the exposures in tables of files, or of the parts of them that single detectors took.
+
+    Raises
+    ------
+    InputError
+        For one that is in two tables, ``{path: table}``, naming both.
+    """
+    origins = {}
+    for path, table in tables.items():
+        for name in _images_of(table):
+            if (first := origins.setdefault(name, path)) is not path:
+                raise InputError(
+                    f"exposure {name} is in two tables, {first} and {path}: leave one out, rename a file, or give the "
+                    "exposures other names in a column exposure"
+                )
+    return list(origins)
+
+
+def with_mark(table, mark, path):
+    """The table of a file with something before the names of its exposures, and of the file itself."""
+    if not mark:
+        return table
+    out = table.copy(copy_data=False)
+    out["exposure"] = Column(
+        [mark + name for name in table["exposure"]], dtype=str, description=column_contract.OF_FILE
+    )
+    for name in set(out["exposure"]):
+        exposure_names.check_exposure_name(name, path)
+    for key in {"shapes"} & set(out.meta):
+        out.meta[key] = {mark + name: each for name, each in out.meta[key].items()}
+    out.meta["inputs"] = {mark * (name == path.name) + name: each for name, each in out.meta["inputs"].items()}
+    return out
+
+
+def named_as_known(table, path, known):
+    """The table of a file with its exposure called as known ones are, which may have a folder before their names.
+
+    Parameters
+    ----------
+    table : Table
+    path : str or path
+        Of its file, of which the exposure has its name; other tables stay as they are.
+    known : iterable of str
+    """
+    path = Path(path)
+    return (
+        with_mark(table, exposure_names.folder_mark(_name_of(path), path, known), path) if _is_of_file(table) else table
+    )
+
+
+def _is_of_file(table):
+    return "exposure" in table.colnames and table["exposure"].info.description == column_contract.OF_FILE
+
+
+def _images_of(table):
+    """Names of the exposures in a table, or of the parts of them that single detectors took."""
+    if "detector" not in table.colnames:
+        return list(dict.fromkeys(table["exposure"]))
+    pairs = zip(table["exposure"], table["detector"], strict=True)
+    return list(dict.fromkeys(exposure_names.detector_name(*pair) for pair in pairs))
+
+
+def _name_of(path):
+    """What the exposure of a list is called, by the name of the file."""
+    stem = Path(path.stem).stem if path.suffix.lower() in (".gz", ".bz2") else path.stem
+    return exposure_names.exposure_name(stem)
+
+
 def _frame_of(name, frames):
     """The longest name of a frame that a name begins with, or the only one that differs by its last word; or None."""
     begins = [frame for frame in frames if re.match(rf"{re.escape(frame)}(?![A-Za-z0-9])", str(name))]
@@ -118,11 +219,10 @@ def _frame_of(name, frames):
 
 def _united(parts, path):
     """One table of the parts of a file, ``{number: table}``, each an exposure of its own unless it has a name."""
-    stem = Path(path.stem).stem if path.suffix.lower() in (".gz", ".bz2") else path.stem
     shapes = {}
     for number, table in parts.items():
         if "exposure" not in table.colnames:
-            name = exposure_names.exposure_name(stem) + (f"_{number}" if number is not None else "")
+            name = _name_of(path) + (f"_{number}" if number is not None else "")
             exposure_names.check_exposure_name(name, path)
             table["exposure"] = Column(np.full(len(table), name), description=column_contract.OF_FILE)
             if "shape" in table.meta:
@@ -168,7 +268,7 @@ def _fill_errors(table, error):
 
 
 def write_stars(solution, path, *, epoch=None, overwrite=False):
-    """Write the stars of a solution as ECSV, FITS, VOTable or CSV, by the suffix.
+    """Write the stars of a solution as ECSV, FITS, VOTable, CSV or plain text, by the suffix.
 
     Names, units and UCDs follow the Virtual Observatory (`legdistort.inputs.column_contract.STARS`).
 
@@ -176,7 +276,7 @@ def write_stars(solution, path, *, epoch=None, overwrite=False):
     ----------
     solution : Solution
     path : str or path
-        Ending in ``.ecsv``, ``.fits``, ``.vot``, ``.xml`` or ``.csv`` (without units).
+        Ending in ``.ecsv``, ``.fits``, ``.vot``, ``.xml``, or without units ``.csv``, ``.txt``, ``.dat``.
     epoch : float or `~astropy.time.Time`, optional
         Where they are at this time instead: `Solution.stars_at`.
     overwrite : bool

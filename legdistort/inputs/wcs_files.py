@@ -6,7 +6,7 @@ from ..exceptions import InputError
 from ..runtime.asdf_files import ARCHIVES, read_tree
 from ..runtime.provenance import checksum_of, unchanged
 from .detector_files import with_detectors
-from .exposure_files import ExposureFile, expand_paths, open_exposures
+from .exposure_files import ExposureFile, expand_paths, open_exposures, told_apart
 from .exposure_names import exposure_name
 from .foreign_images import header_of_meta
 from .frames.header_texts import TEXTS
@@ -46,10 +46,7 @@ def open_wcs(paths, *, ext=None, shape=None):
     if shape is not None and not bare:
         raise InputError("--shape comes from the frames of --wcs: leave it out")
     out = (open_exposures(images, ext=ext) if images else []) + bare
-    names = [exposure.name for exposure in out]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError(f"two frames are named {twice[0]}: give one of them")
-    return with_detectors(out) if bare else out
+    return with_detectors(told_apart(out)) if bare else out
 
 
 def _tree(source):

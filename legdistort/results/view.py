@@ -17,7 +17,7 @@ from ..geometry import similarity, star_hull
 from ..geometry.distortion import Distortion
 from ..geometry.models import exposure_model, like, outside, to_pixels
 from ..inputs.detector_files import label_of
-from ..inputs.exposure_names import detector_name
+from ..inputs.exposure_names import detector_name, folder_mark, marked, whole_name
 from ..plots import solution_plots
 from ..runtime.checks import check_counts
 from ..runtime.notebook import ShownAsPrinted
@@ -748,7 +748,10 @@ def image_view(solution, image):
     if key in solution:
         return solution[key]
     parts = {part.label: part for view in solution for part in view.parts}
-    return parts.get(label_of(image.name, image.header, parts, exact=not of_camera))
+    label = label_of(image.name, image.header, parts, exact=not of_camera)
+    if label is None and image.path is not None and (mark := folder_mark(whole_name(image), image.path, parts)):
+        return image_view(solution, marked(image, mark))
+    return parts.get(label)
 
 
 def error_map(view, *, n=64, support=True, absolute=False):

@@ -10,6 +10,7 @@ A map of the focal plane can be exchanged between detectors and exposures: direc
 where they are, which keeps the change of the camera as small as it can be.
 """
 
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -194,7 +195,8 @@ class CameraFit:
             sought = Sought(free, np.full(free.shape, np.inf))
         part, last = 1.0, np.zeros(sought.free.shape)
         for _ in range(_STEPS):
-            fit = self.join(estimate(matches))
+            with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):  # the fit that comes last warns
+                fit = self.join(estimate(matches))
             self.step = camera_step(fit, sought, self._departure, self._stated)
             # exposures give way to a change that they can undo, and then it comes back: half of it does not
             part = 0.5 if np.vdot(last, self.step.change) < -_BACK * np.vdot(last, last) else part

@@ -258,7 +258,7 @@ def solve(
     tying = {"error": reference_error, "degree": reference_degree, "epoch": epoch}
     catalogue, epoch = check_tie(matches, asked, reference, **tying)
     if model is None:
-        _warn_of_header(matches, prior)
+        _tell_of_prior(matches, prior, degree)
     is_prior = matches.camera.has_focal_plane or static in ("hold", "prior")  # of the camera, or the prior, by now
     options, form = replace(asked, static=None, layout=None) if is_prior else asked, None
     if model is not None:
@@ -474,8 +474,15 @@ def _estimate(matches, options):
     return fit, {}
 
 
-def _warn_of_header(matches, prior):
-    """Warn of a distortion in the headers that is not used."""
+def _tell_of_prior(matches, prior, degree):
+    """Say what the default of the degree leaves of a prior of a higher one; warn of an unused distortion of headers."""
+    each = prior.values() if isinstance(prior, dict) else [prior]
+    highest = max((p.degree for p in each if p is not None and p.states_mean), default=0)
+    if isinstance(degree, Unasked) and highest > degree:
+        log.info(
+            "exposures are fitted to degree %d, the default: what the prior has beyond, up to degree %d, is held as "
+            "given; degree=%d (--degree %d) fits that too", degree, highest, highest, highest,
+        )  # fmt: skip
     if matches.header_distortion and not has_distortion(prior):
         warn(
             f"the headers have a distortion ({matches.header_distortion}) that is not used; --prior header takes it as "
@@ -510,7 +517,8 @@ def _choose_degree(matches, options):
 
 def _tell(fit, matches):
     """Log how the fit ended and what it left out, and warn of what these exposures cannot determine."""
-    log.info("%s; chi2 %.1f for %.0f degrees of freedom", fit.result.status, fit.chi2, fit.dof)
+    left = f"chi2 {fit.chi2:.1f} for {fit.dof:.0f} degrees of freedom" if fit.dof > 0.5 else "as many unknowns as data"
+    log.info("%s; %s", fit.result.status, left)
     _tell_lost_exposures(fit, matches)
     _tell_lost_stars(fit)
     fields = None if fit.tabled is None else fit.tabled.errors

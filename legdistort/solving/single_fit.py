@@ -166,6 +166,8 @@ def estimate(matches, options, **how):
             return estimate(fit.matches, options)
     if np.mean(fit.used) < 1 - clipping.USUAL and (plain := _with_plain_widths(matches, options)):
         return plain
+    if not widths.have_settled:
+        fit = replace(fit, result=replace(fit.result, status=f"{fit.result.status}; widths of the prior not"))
     return _about_their_static(replace(fit, widths=widths))
 
 

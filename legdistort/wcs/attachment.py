@@ -102,9 +102,9 @@ def attach(
     ``PLTRAH``, ``AMDX1``, ``XPIXELSZ`` ...), polynomials of IRAF and wcstools. The errors hold for the header as it
     stands in the file. Nothing is written unless everything can be.
 
-    Frames are identified by their names, as `read_exposures` gives them; where none is so called, by these but for the
-    last word, as products of pipelines differ (``x_cal``, ``x_wcs``), which is logged. A frame that was left out of the
-    solution is skipped, which is logged.
+    Frames are identified by their names, as `read_exposures` gives them, with a folder before them too; where none is
+    so called, by these but for the last word, as products of pipelines differ (``x_cal``, ``x_wcs``), which is logged.
+    A frame that was left out of the solution is skipped, which is logged.
 
     Parameters
     ----------
@@ -226,6 +226,11 @@ class _Images:
     fluxes: FluxCards
     moved: dict = field(default_factory=dict)
 
+    def called(self, path):
+        """The path of a file as exposures are named after it: with a folder before its name, where they have that."""
+        labels = {*self.views, *self.left_out}
+        return path.with_name(exposure_names.folder_mark(exposure_names.exposure_name(path), path, labels) + path.name)
+
     def of_file(self, name, header):
         """Name of the exposure, or of the part of one, in a file of one detector; None if it is of another."""
         labels = {*self.views, *self.left_out}
@@ -292,7 +297,8 @@ def _copies(out, overwrite):
 
 def _targets(paths, out, overwrite, *, as_texts):
     """Where copies go, or texts of headers: into a folder, or beside the frames."""
-    targets = [path.resolve() if out is None else out / path.name for path in paths]
+    names = exposure_names.file_names(paths)
+    targets = [path.resolve() if out is None else out / name for path, name in zip(paths, names, strict=True)]
     targets = [header_texts.beside(path) for path in targets] if as_texts else targets
     for i, (path, target) in enumerate(zip(paths, targets, strict=True)):
         if target in targets[:i]:
@@ -340,7 +346,7 @@ def _plan(known, path, target, *, kind, max_error, ext, overwrite):
             whole = _head(hdulist, of_images)
         elif images:
             edits += _foreign_edits(known, images, spans, raw, path) or _asdf_edits(
-                known, images, spans, *_tables(hdulist, spans, path, overwrite)
+                known, images, spans, *_tables(known, hdulist, spans, path, overwrite)
             )
     return _Plan(path, target, zlib.crc32(raw), headers, edits, elsewhere, whole)
 
@@ -356,7 +362,7 @@ def _plan_of_tree(known, path, target, raw, kind):
     """The `_Plan` of an ASDF file of Roman, which holds no headers."""
     if kind == "head":
         raise InputError(f"{path} is no FITS file: SWarp and SCAMP do not read it")
-    name = exposure_names.exposure_name(path)
+    name = exposure_names.exposure_name(known.called(path))
     if (found := model_wcs(raw, str(path))) is None:
         raise InputError(f"{path} has no gwcs at {' or '.join('.'.join(keys) for keys in PLACES)}")
     name = name if name in known.views else known.of_file(name, found[2]) or name
@@ -473,10 +479,11 @@ def _number(hdulist, hdu):
 
 def _images(known, hdulist, path, ext):
     """``{exposure: number of its HDU}`` of one file; empty if it was left out of the solution."""
-    candidates = {exposure_names.exposure_name(path, ext): ext}
+    called = known.called(path)
+    candidates = {exposure_names.exposure_name(called, ext): ext}
     if ext is None:
-        candidates = file_images.extension_names(hdulist, path)
-    candidates |= file_images.detector_names(hdulist, path, ext) | _in_a_file_of_its_own(
+        candidates = file_images.extension_names(hdulist, called)
+    candidates |= file_images.detector_names(hdulist, called, ext) | _in_a_file_of_its_own(
         known, candidates, hdulist, path
     )
     found = {name: form for name, form in candidates.items() if name in known.views}
@@ -519,13 +526,13 @@ def _nothing(known, path, name):
     return {}
 
 
-def _tables(hdulist, spans, path, overwrite):
+def _tables(known, hdulist, spans, path, overwrite):
     """Extensions ASDF of a file: ``{number of the image: Span}``, and a list of those to be removed.
 
     One of ours names its exposure: numbers of HDUs change when fpack and other programs move them. Where that is no
     image of this file, since the file was renamed, it is removed, and so, if asked for, is that of another program.
     """
-    named, of_images, others = file_images.named_images(hdulist, path), {}, []
+    named, of_images, others = file_images.named_images(hdulist, known.called(path)), {}, []
     for span in spans:
         if span.header.get("EXTNAME") != "ASDF":
             continue

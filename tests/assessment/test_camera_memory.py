@@ -405,6 +405,13 @@ def test_nights_that_do_not_go_together_are_refused(three, tmp_path):
     other = ld.solve(ld.Matches.from_table(night(6, static(1), n_stars=60, exposures=4), shape=(SIZE, SIZE + 8)))
     with pytest.raises(InputError, match="detectors of several shapes"):
         ld.combine_nights([three[0], other])
+    alone, first = tmp_path / "alone", three[0].names[0]
+    rows = three[0].residuals["exposure", "star", "x", "y", "x_err", "y_err"]
+    matches = ld.Matches.from_table(rows[np.asarray(rows["exposure"]) == first], shape=SHAPE)
+    known = three[0].stars["star", "x", "y", "x_err", "y_err"]
+    ld.solve(matches, prior=static_prior(1), reference=known).write(alone)
+    with pytest.raises(InputError, match=rf"alone has one exposure, {first}, which alone .*: bring it into a night of"):
+        ld.combine_nights([*three[1:], alone])
     with pytest.raises(InputError, match="no nights: give solutions"):
         ld.combine_nights([])
     with pytest.raises(InputError, match="earlier combinations, got int"):

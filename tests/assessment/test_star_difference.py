@@ -20,8 +20,13 @@ def solved(table, **options):
 
 
 def halves(nights, moved=None, **options):
-    """Solutions of every other night, which have no exposure in common; of the second a star is somewhere else."""
+    """Solutions of every other night, which have no exposure in common; of the second a star is somewhere else.
+
+    Without motions no times are stated either.
+    """
     table = nights.table.copy()
+    if "motion" not in options:
+        del table["epoch"]
     second = table["block"] % 2 == 1
     if moved is not None:
         table["x"][second & (table["star"] == moved)] += 0.3
@@ -103,6 +108,25 @@ def test_a_star_that_is_somewhere_else_is_named():
     assert wrong.stars.places.p < 1e-6
     assert wrong.stars.table["star"][0] == 17
     assert wrong.stars.table["dx"][0].value == pytest.approx(0.3, abs=0.06)
+
+
+def test_years_without_motions_have_no_chance():
+    """They are the motions of the stars, which no error of the two has; and without years there is one."""
+    nights = Nights(2, nights=4, per=3, n_stars=120, motion=0.05)
+    table = nights.table.copy()
+    years = np.asarray(table["epoch"])
+    early = years < np.median(years)
+    pair = [solved(table[mine]) for mine in (early, ~early)]
+    gap = np.mean(years[~early]) - np.mean(years[early])
+    for one, two, word in ((*pair, "later"), (*pair[::-1], "earlier")):
+        found = ld.difference(one, two).stars
+        assert np.isnan(found.places.p)
+        assert abs(found.to_dict()["unmoved_yr"]) == pytest.approx(gap, rel=0.05)
+        assert f"years {word}, and neither has motions: the stars moved by these years of them" in str(found.lines())
+    table["epoch"] = 2020.0
+    found = ld.difference(*(solved(table[mine]) for mine in (early, ~early))).stars
+    assert found.years == 0
+    assert found.places.p < 1e-6
 
 
 def test_stars_of_other_names_are_found_by_their_places():

@@ -893,7 +893,7 @@ def test_another_epoch_needs_motions(demo, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     "words",
-    ["report s.asdf --out x.pdf", "measure FRAMES --out x.fits", "prior gsaoi-2 --out x", "match t --out x.txt"],
+    ["report s.asdf --out x.pdf", "measure FRAMES --out x.fits", "prior gsaoi-2 --out x", "match t --out x.doc"],
 )
 def test_a_file_of_another_type_is_refused(words, night, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -257,7 +257,7 @@ def test_foreign_files_with_a_gwcs_alone(shared_data):
             r"a_wcs.asdf has no gwcs at meta.wcs or roman.meta.wcs or wcs, nor an",
         ),
         (lambda path: _frame(path), (N, N), r"--shape comes from the frames of --wcs: leave it out"),
-        (lambda path: _twice(path), (N, N), "two frames are named a_wcs: give one of them"),
+        (lambda path: _twice(path), (N, N), "two exposures are named 'a_wcs' .*; rename a file, or give one of them"),
         (
             lambda path: write_head(path.with_suffix(".head")),
             None,

@@ -48,12 +48,12 @@ def test_several_images_are_refused_with_their_list(tmp_path, read, names, told,
     assert np.array_equal(chosen.read().data, pixels(2 if len(names) == 4 else 1))
 
 
-def gemini_file(path, *, names=("", "", "", ""), section="DETSEC", chips="1234"):
+def gemini_file(path, *, names=("", "", "", ""), section="DETSEC", chips="1234", ids="EXTVER"):
     """A raw frame of GSAOI: four images without a name, with EXTVER and their sections of the array."""
     hdus = [fits.PrimaryHDU(header=fits.Header({"INSTRUME": "GSAOI", "EXPTIME": 30.0}))]
     for k, (name, corner) in enumerate(zip(names, ("257:512,1:256", "1:256,1:256", "1:256,257:512", "257:512,257:512"),
                                            strict=True)):  # fmt: skip
-        cards = {"EXTVER": k + 1, "CCDSEC": "[1:256,1:256]", "CCDNAME": f"H2RG-{chips[k]}", section: f"[{corner}]"}
+        cards = {ids: k + 1, "CCDSEC": "[1:256,1:256]", "CCDNAME": f"H2RG-{chips[k]}", section: f"[{corner}]"}
         hdus.append(fits.ImageHDU(pixels(k), fits.Header(cards), name or None))
     fits.HDUList(hdus).writeto(path)
     return path
@@ -81,6 +81,29 @@ def test_images_without_a_name_are_detectors_by_their_sections(tmp_path, caplog,
     assert [each.name for each in read([raw, plain])] == [each.name for each in found] + ["one"]
     with pytest.raises(InputError, match=r"'SCI'; the file has .*: leave ext \(--ext\) out to read all detectors"):
         read(raw, ext="SCI")
+
+
+@pytest.mark.parametrize("ext", [None, ""])
+@pytest.mark.parametrize(("ids", "named"), [("FRAMEID", "1234"), ("NOTHING", ["H2RG-2", "H2RG-1", "H2RG-4", "H2RG-3"])])
+def test_detectors_without_versions_are_read_by_their_number(tmp_path, ids, named, ext):
+    """Neither names nor EXTVER: by what else tells them apart, all four, and found again by `attach`."""
+    path = gemini_file(tmp_path / "S1.fits", ids=ids, chips="2143")
+    found = ld.open_exposures(path, ext=ext)
+    assert [each.name for each in found] == [f"S1-{key}" for key in named]
+    assert [each.detector for each in found] == list(named)
+    for k, each in enumerate(found):
+        assert_array_equal(each.read().data, pixels(k))
+    with fits.open(path) as hdulist:
+        forms = detector_names(hdulist, path)
+        assert all(find_image(hdulist, forms[each.name], "raw") is hdulist[k + 1] for k, each in enumerate(found))
+
+
+def test_images_of_one_name_and_version_are_all_read(tmp_path):
+    """Never one of them in silence: as the detectors 1, 2, ..., since nothing else tells them apart."""
+    path = mosaic_file(tmp_path / "mef.fits", ("S", 1), ("S", 1))
+    found = ld.read_exposures(path, ext="S")
+    assert [each.name for each in found] == ["mef-1", "mef-2"]
+    assert all(np.array_equal(each.data, pixels(k)) for k, each in enumerate(found))
 
 
 @pytest.mark.parametrize(

@@ -338,10 +338,10 @@ TEXTS = {
 }
 
 
-@pytest.mark.parametrize("ending", [".fits", ".ecsv", ".vot", ".csv"])
+@pytest.mark.parametrize("ending", [".fits", ".ecsv", ".vot", ".csv", ".txt", ".dat"])
 @pytest.mark.parametrize("kind", TEXTS)
 def test_any_text_is_written_and_read(tmp_path, ending, kind):
-    if kind == "pairs" and ending in (".csv", ".vot"):
+    if kind == "pairs" and ending in (".csv", ".txt", ".dat", ".vot"):
         pytest.skip("no columns of two words each in CSV, nor in astropy's VOTable")
     table = Table({"star": TEXTS[kind], "x": [1.0, 2, 3]})
     write_by_ending(table, tmp_path / f"t{ending}")

@@ -391,7 +391,7 @@ def test_command(solution, tmp_path, capsys):
     assert_allclose(back["ra_error_abs"].to_value(u.mas), expected["ra_error_abs"].to_value(u.mas))
     assert main([*command, str(tmp_path / "out.ecsv")]) == 1
     assert "exists" in capsys.readouterr().err
-    assert main([*command, str(tmp_path / "out.txt")]) == 1
+    assert main([*command, str(tmp_path / "out.doc")]) == 1
     assert "the ending selects the format" in capsys.readouterr().err
 
 

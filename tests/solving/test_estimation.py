@@ -199,6 +199,17 @@ def test_prior_of_higher_degree_keeps_its_upper_modes():
     assert solution.chi2 / solution.dof == pytest.approx(1, abs=5 * np.sqrt(2 / solution.dof))
 
 
+@pytest.mark.parametrize(("degree", "said"), [({}, True), ({"degree": 3}, False)])
+def test_what_the_default_degree_leaves_of_a_prior_is_said(caplog, degree, said):
+    sim = simulate_matches(degree=4, seed=8, n_stars=60)
+    with caplog.at_level("INFO"):
+        solve(sim.matches, prior=Prior(sim.truth.static, static_sigma=0.01), **degree)
+    words = (
+        "fitted to degree 3, the default: what the prior has beyond, up to degree 4, is held as given; degree=4 (--deg"
+    )
+    assert (words in caplog.text) == said
+
+
 def test_prior_width_makes_sparse_fields_solvable():
     sim = simulate_matches(n_stars=8, n_exposures=12, seed=9)
     with pytest.raises(SolveError, match=r"exp00 has 8 stars, fewer than the 10 modes of degree 3: .*at most 2 here"):

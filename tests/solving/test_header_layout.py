@@ -55,6 +55,23 @@ def test_it_is_found_by_default(far, solution):
     assert "group" not in solution.stars.colnames
 
 
+def test_the_check_says_how_far_headers_have_each_detector(far, solution):
+    """By numpy: corners where headers have them, after one similarity, less where they lie."""
+    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * header_layouts.SIZE - 0.5
+    stated, right = (
+        np.array([(corners - place[:, 2]) @ np.linalg.inv(place[:, :2]).T for place in each])
+        for each in (far.stated, far.places)
+    )
+    z, w = (each.reshape(-1, 2) @ [1, 1j] for each in (stated, right))
+    a, b = np.linalg.lstsq(np.stack([z, np.ones(len(z))], axis=1), w, rcond=None)[0]
+    off = np.abs((a * z + b - w).reshape(4, 4).mean(axis=1))
+    (check,) = [each for each in solution.checks if each.name == "camera"]
+    told = re.search(r"detectors up to ([\d.]+) px from where the stars put them \((.*) px\), and none", check.sentence)
+    assert float(told[1]) == pytest.approx(off.max(), abs=1.5)
+    each = dict(word.split() for word in told[2].split(", "))
+    np.testing.assert_allclose([float(each[key]) for key in header_layouts.KEYS], off, atol=1.5)
+
+
 def test_it_does_not_matter_how_wrong_it_was(near, far, solution):
     """The same night by headers that are ten times nearer: the same stars after the map that nothing determines.
 

@@ -5,6 +5,7 @@ import re
 
 import dense_model
 import drawn_sets
+import four_detectors
 import numpy as np
 import oracle
 import pytest
@@ -491,8 +492,22 @@ def test_wrong_priors_are_told():
 
 def test_widths_that_do_not_settle_are_warned_of(monkeypatch):
     monkeypatch.setattr(prior_widths, "MAX_ROUNDS", 1)
-    with warns_here(ConvergenceWarning, match="the widths of the prior have not settled after 1 fits"):
-        found(simulate(40))
+    with warns_here(
+        ConvergenceWarning, match="have not settled after 1 fits.*; leave them out .*forget prior-sigma"
+    ) as told:
+        solution = found(simulate(40))
+    assert solution.status.endswith("; widths of the prior not")
+    assert len(told) == 1
+
+
+def test_of_a_camera_that_is_found_they_are_warned_of_once(monkeypatch):
+    """It is fitted many times, each time with widths; what counts is the last."""
+    monkeypatch.setattr(prior_widths, "MAX_ROUNDS", 1)
+    matches = four_detectors.matches("layout", 1)
+    with warns_here(ConvergenceWarning, match="the widths of the prior have not settled after 1 fits") as told:
+        solution = solve(matches, degree=2, layout="fit", prior=Prior(None, sigma="evidence"))
+    assert len([each for each in told if "have not settled" in str(each.message)]) == 1
+    assert "; widths of the prior not" in solution.status
 
 
 # --- without a mean ----------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """What the check of a reference says of right and wrong ones. Truth from numpy alone (`dense_model`)."""
 
+import re
 import warnings
 
 import dense_model
@@ -267,3 +268,18 @@ def test_whose_map_it_cannot_be():
         ld.solve(matches, reference_degree=2)
     with pytest.raises(ld.exceptions.InputError, match="a solution states what is known of its plane"):
         ld.solve(matches, reference=ld.solve(matches), reference_degree=2)
+
+
+@pytest.mark.parametrize(("how", "said"), [({}, True), ({"static": "fit"}, False)], ids=["held", "fitted"])
+def test_a_reference_that_is_not_found_may_be_right_where_detectors_are_distorted(how, said):
+    """Places that no star has: with distortions left in the positions, the message names these too."""
+    matches = four_detectors.matches("static", 1)
+    places = np.random.default_rng(1).uniform(-300, 2400, (60, 2)) + 9000
+    other = Table({"x": places[:, 0], "y": places[:, 1], "x_err": [0.01] * 60, "y_err": [0.01] * 60})
+    words = r"Or detectors have distortions of their own: chi2 is \d+ for \d+ degrees of freedom; fit them, static="
+    with (
+        warnings.catch_warnings(action="ignore", category=LegdistortWarning),
+        pytest.raises(ld.exceptions.InputError, match="lies where a star of the exposures is") as error,
+    ):
+        ld.solve(matches, degree=2, reference=other, **how)
+    assert bool(re.search(words, str(error.value))) == said

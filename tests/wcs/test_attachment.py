@@ -792,8 +792,14 @@ def test_places_that_are_taken(one, frame, tmp_path):
     attach(one, frame, out=tmp_path / "out", overwrite=True, kind=None)
     with pytest.raises(InputError, match=r"frame.fits is given twice"):
         attach(one, [frame, str(frame)], in_place=True)
+    several = [
+        tmp_path / each / "frame.fits" for each in ("a/x", "a/y", "b/x")
+    ]  # which no level of folders tells apart
+    for path in several:
+        path.parent.mkdir(parents=True)
+        shutil.copy(frame, path)
     with pytest.raises(InputError, match=r"two frames are named frame.fits"):
-        attach(one, [frame, tmp_path / "out" / "frame.fits"], out=tmp_path / "both")
+        attach(one, several, out=tmp_path / "both")
     with pytest.raises(InputError, match="frames must be paths of FITS files, got HDUList"):
         attach(one, fits.HDUList(), in_place=True)
 

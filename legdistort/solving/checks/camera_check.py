@@ -7,11 +7,12 @@ import numpy as np
 
 from ...cameras import ties
 from ...cameras.header_layout import FAR, LEAST, compare_headers
+from ...exceptions import some_of
 from ...geometry import similarity
 from ...matching.detector_places import REACH, TURNS
 from ...results.check import WRONG, Check, FactorTest, state_of
 from .known_effects import DEPARTURES, LAYOUT, STATICS
-from .limits import SEEN, addition_that_shows, as_one
+from .limits import MOST_NAMED, SEEN, addition_that_shows, as_one
 
 #: Stars that cross, from which on it tells something that they are left out.
 _FEWEST = 4
@@ -120,8 +121,26 @@ def _headers(solution, found):
         far = max(np.hypot(*shift) for shift, agrees in zip(headers.shifts, headers.agree, strict=True) if not agrees)
         cure = _ODD if found else f"--layout fit tells which of the two is right; {_ODD}"
         return Check("camera", "warn", far, LEAST, words, cure)
-    words = f"the headers have the detectors where they lie, to {headers.scatter:.2g} px"
-    return Check("camera", "pass", headers.scatter, FAR, words)
+    where = "the stars put them" if found else f"camera {camera.name} has them, which was given"
+    return Check("camera", "pass", headers.scatter, FAR, _alike(solution, headers, where))
+
+
+def _alike(solution, headers, where):
+    """By how much headers that do not contradict one another have detectors elsewhere, in words, and what hides it."""
+    if headers.scatter < LEAST:
+        return f"the headers have the detectors where {where}, to {headers.scatter:.2g} px"
+    far = zip(headers.names, np.hypot(*headers.shifts.T), strict=True)
+    each = some_of([f"{key} {off:.2g}" for key, off in far], MOST_NAMED)
+    words = (
+        f"the headers have the detectors up to {headers.scatter:.2g} px from where {where} ({each} px), and none "
+        "contradicts the others"
+    )
+    if solution.degree > 1 and solution.camera.common_sigma is not None:
+        words += (
+            f"; a map of degree {solution.degree} of all detectors together, which exposures took over, shifts and "
+            "turns single ones too, and is in none of these"
+        )
+    return words
 
 
 def contradicted_layout(solution, camera):

@@ -45,10 +45,12 @@ class Widths:
         Each once: exposures and detectors that were given the same object share its widths.
     values : ndarray, shape (n_priors, degree)
         Of a coefficient of degree 1, 2 and more, pixels.
+    have_settled : bool
     """
 
     priors: tuple
     values: np.ndarray
+    have_settled: bool = True
 
     def number(self, prior):
         """Which of the priors this one is; -1 if it is none of them."""
@@ -108,7 +110,7 @@ def find_widths(fit, prior, degree, unit, *, scale=False):
         0 where one was held at the smallest.
     """
     wanted, bounds = sought(prior), unit * np.array(RANGE)
-    widths = Widths(wanted, np.full((len(wanted), degree), unit))
+    widths, have_settled = Widths(wanted, np.full((len(wanted), degree), unit)), True
 
     def fitted():
         with warnings.catch_warnings(record=True, action="always") as caught:  # those of the last fit are shown
@@ -126,11 +128,17 @@ def find_widths(fit, prior, degree, unit, *, scale=False):
     else:
         done, caught = fitted()
         if degree:
-            words = f"the widths of the prior have not settled after {MAX_ROUNDS} fits, the last are {widths.values} px"
-            warn(words, ConvergenceWarning)
+            have_settled = False
+            warn(
+                f"the widths of the prior have not settled after {MAX_ROUNDS} fits, the last are "
+                f"{np.array2string(widths.values, precision=2)} px: do not rely on the result; leave them out (no "
+                "--prior-sigma; --forget prior-sigma where a run is repeated), or give them, sigma=0.05 (--prior-sigma "
+                "0.05)",
+                ConvergenceWarning,
+            )
     for warning in caught:
         warn(warning.message, warning.category)
-    return done, Widths(wanted, np.where(widths.values > 1.01 * bounds[0], widths.values, 0))
+    return done, Widths(wanted, np.where(widths.values > 1.01 * bounds[0], widths.values, 0), have_settled)
 
 
 def _labels(widths, priors):

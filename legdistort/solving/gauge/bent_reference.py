@@ -18,6 +18,8 @@ from .catalogue_agreement import agreement
 
 #: Part of the information of the exposures that a position of a straightened reference has at least.
 _LEAST = 1e-6
+#: chi2 over its degrees of freedom from which positions have more in them than exposures and layouts explain.
+_MISFIT = 2.0
 
 
 def check_degree(reference, n, degree):
@@ -135,3 +137,15 @@ def _beside(covariance, own, rest):
     size, vectors = np.linalg.eigh(np.linalg.inv(left) - np.linalg.inv(own))
     least = _LEAST / np.einsum("naa->n", own)
     return (vectors / np.maximum(size, least[:, None])[:, None]) @ vectors.transpose(0, 2, 1)
+
+
+def or_detectors(fit):
+    """What else may keep stars of a reference from their places: distortions of detectors that are not fitted."""
+    errors = fit.camera_errors
+    is_fitted = errors is not None and errors.free[:, :, 3:].any()
+    if is_fitted or not fit.matches.camera.has_focal_plane or fit.chi2 < _MISFIT * fit.dof:
+        return ""
+    return (
+        f" Or detectors have distortions of their own: chi2 is {fit.chi2:.0f} for {fit.dof:.0f} degrees of freedom; "
+        "fit them, static='fit' (--static fit)"
+    )
