@@ -140,8 +140,9 @@ def given_prior(a):
     made = found.prior()
     files = {name: checksum for prior in each for name, checksum in _files_of(prior).items()}
     record = made.source | {"kind": "several", "name": ", ".join(paths), "files": files}
-    widths = {name: asked[name] for name in ("sigma", "static_sigma") if name in asked}
-    made = replace(made, source=record, truncation=max(prior.truncation for prior in each), **widths)
+    made = made.with_static_sigma(asked["static_sigma"]) if "static_sigma" in asked else made
+    known = {"source": record, "truncation": max(prior.truncation for prior in each)}
+    made = replace(made, **known | {name: asked[name] for name in ("sigma",) if name in asked})
     words = f"mean of {len(each)} sources"
     return made, words if a.static_sigma is not None else f"{words}; {_said_of_scatter(found.scatter, len(each))}"
 

@@ -238,6 +238,11 @@ class Prior(ShownAsPrinted):
         known = {"static_sigma": static, "static_covariance": self.static_covariance_to(degree)}
         return replace(self, mean=basis.change_degree(self.mean, degree), sigma=sigma, **known)
 
+    @plain_numbers
+    def with_static_sigma(self, static_sigma: ArrayLike | None) -> Prior:
+        """The same prior with another uncertainty `static_sigma` of its mean, in the place of a covariance too."""
+        return replace(self, static_sigma=static_sigma, static_covariance=None)
+
     def __repr__(self) -> str:
         if self.mean is None:
             return f"<Prior: not known, {self.static_sigma:g} px a mode>"

@@ -1,6 +1,6 @@
 """Priors as ASDF files, and reading a prior of any kind."""
 
-import dataclasses
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -75,9 +75,8 @@ def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=No
         if given:
             named = ", ".join(f"{key} (--{key})" for key in given)
             raise InputError(f"{where} is a prior already: {named} cannot be chosen any more; leave it out")
-        if "static_sigma" in widths:
-            widths["static_covariance"] = None
-        return dataclasses.replace(ready, **widths)
+        ready = ready.with_static_sigma(widths.pop("static_sigma")) if "static_sigma" in widths else ready
+        return replace(ready, **widths)
     files = where if isinstance(where, (list, tuple)) else [where]
     files = [path for path in files if isinstance(path, (str, Path))]
     with provenance.unchanged(*files):

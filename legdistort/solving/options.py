@@ -241,7 +241,7 @@ def prior_as_asked(prior, static):
             "--static-sigma): give it, or static='hold'"
         )
     if static == "hold":
-        named = {name: replace(each, static_sigma=None, static_covariance=None) for name, each in named.items()}
+        named = {name: each.with_static_sigma(None) for name, each in named.items()}
     return named if isinstance(prior, dict) else named[None]
 
 

@@ -258,7 +258,7 @@ def test_a_covariance_has_widths_and_is_kept(tmp_path):
     read = Prior.read(prior.write(tmp_path / "prior.asdf"))
     assert_allclose(read.static_covariance, covariance, atol=1e-15)
     assert read.with_sigma(0.1).static_covariance is not None
-    wider = replace(read, static_sigma=0.3, static_covariance=None)
+    wider = read.with_static_sigma(0.3)
     assert wider.static_covariance is None
     assert_array_equal(wider.static_sigma, np.full((2, 10), 0.3))
     assert Prior.from_file(tmp_path / "prior.asdf", static_sigma=0.3).static_covariance is None
