@@ -20,6 +20,7 @@ from ..matching.matches import Matches
 from ..priors.prior import UNSTATED, Prior, has_distortion
 from ..results.diagnostics import Diagnostics
 from ..results.errors.common_distortion import with_common_map
+from ..results.gauge import warning_of
 from ..results.settings import Settings
 from ..runtime.guards.units import plain_numbers
 from . import minimisers, model_forms, reference_tie, single_fit, star_motions
@@ -278,8 +279,8 @@ def solve(
     sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
     found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue), epoch=epoch)
     solution = _with_camera(_solution(fit, scale, _settings(asked, options, form), found, form), given)
-    if solution.gauge.warning:
-        log.warning("%s", solution.gauge.warning)
+    if words := warning_of(solution):
+        log.warning("%s", words)
     if kept_out is None:
         return solution
     if sought is not None:

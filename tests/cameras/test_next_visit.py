@@ -106,6 +106,10 @@ def test_the_next_visit_has_the_scale_and_the_rotation_of_the_first(night, first
     alone = ld.solve(matched(night, 1), prior=EVIDENCE)
     assert off_sky(night, alone)[0] == pytest.approx(SCALE, rel=0.1)
     assert not alone.camera.states_scale
+    absolute = next(check for check in alone.checks if check.name == "absolute")
+    assert absolute.state == "unknown"
+    assert "(match --camera RESULTS)" in absolute.cure
+    assert "--prior" not in absolute.cure
 
 
 def test_the_errors_of_the_common_map_are_those_of_the_reference(first):
