@@ -106,11 +106,14 @@ def _of_nights(nights, label):
 def _of_camera(camera, label, common=None):
     """The detectors of a camera, the shear of whose layouts is a part of their maps.
 
-    One that was found from exposures knows nothing of a map that all its detectors share, which these took over: it is
-    taken as the `common` one (2, n) of what it is compared with.
+    One that was found from exposures knows nothing of a map that all its detectors share, which these took over, unless
+    a reference told it: it is taken as the `common` one (2, n) of what it is compared with.
     """
     statics = {key: map_alone(each)[1] for key, each in camera.detectors.items()}
-    n = _n_found(camera)
+    n, sigma = _n_found(camera), NOTHING
+    if camera.common_map is not None:
+        n = camera.common_map.shape[1]
+        common, sigma = camera.common_map, np.minimum(camera.common_sigma.ravel(), NOTHING)
     if n and common is not None:
         statics = {key: _whole(camera, each, common[:, :n]) for key, each in camera.detectors.items()}
     shapes = {key: each.shape for key, each in camera.detectors.items()}
@@ -123,7 +126,7 @@ def _of_camera(camera, label, common=None):
             whole = [np.pad(each, ((0, 0), (0, max(w.shape[1] - n, 0)), (0, 0)))[:, : w.shape[1]]
                      for each, w in zip(maps, widths, strict=True)]  # fmt: skip
             shared = np.concatenate([each.reshape(-1, 2 * n) for each in whole])
-            covariance += NOTHING**2 * shared @ shared.T
+            covariance += (sigma * shared) @ (sigma * shared).T
     return KnownMap(camera.name if label.startswith("the ") else label, statics, shapes, covariance)
 
 
@@ -137,7 +140,10 @@ def _n_found(camera):
 
 
 def _of_focal_plane(solution, label):
-    """The detectors of a camera that was fitted, with what its exposures have in common; layouts are free."""
+    """The detectors of a camera that was fitted, with what its exposures have in common.
+
+    Of layouts that were held nothing is known, nor of what nothing determined of those that were fitted.
+    """
     errors, camera = solution.estimate.uncertainty.camera, solution.camera
     if errors is None or not errors.free[:, :, 3:].any():
         raise InputError(
@@ -151,7 +157,9 @@ def _of_focal_plane(solution, label):
     mean, covariance, shared = common_distortion(solution, n)
     moved = common @ shared
     moved[free.ravel()] += errors.changes
-    unseen = ~free | (np.arange(n) < 3)
+    unseen = ~free
+    unseen[:, :, :3] |= [np.isinf(each.layout_sigma) if each.layout_sigma is not None else np.ones((2, 3), dtype=bool)
+                         for each in camera.detectors.values()]  # fmt: skip
     covariance = common @ covariance @ common.T + moved @ moved.T + np.diag(NOTHING**2 * unseen.ravel())
     degree, common = basis.degree_of(n), mean.reshape(2, n)
     statics = {key: pointed(_whole(camera, each, common), each.shape) for key, each in camera.detectors.items()}

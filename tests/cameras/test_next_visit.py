@@ -15,6 +15,7 @@ from astropy.wcs import WCS
 
 import legdistort as ld
 from legdistort.exceptions import InputError
+from legdistort.geometry import basis, detector_modes
 
 #: What headers have wrong: relative scale, rotation [deg]; roll [deg] and pointing [px] of two visits beside that.
 SCALE, TURN, ROLLS, POINTINGS = 3e-4, 0.02, (0.002, -0.003), (2.0, -3.0)
@@ -151,3 +152,40 @@ def test_a_map_without_errors_is_refused():
         ld.Camera("c", chip, common_map=[np.nan, 1.0], common_sigma=np.zeros((2, 3)))
     with pytest.raises(InputError, match="header_map is not a similarity"):
         ld.Camera("c", chip, header_map=[[1.0, 0.5, 0.0], [0.0, 1.0, 0.0]])
+
+
+def shared_on(key):
+    """Coefficients (2, 10) on a detector of what all exposures share, shift, rotation and scale taken off."""
+    shape, powers = (header_layouts.SIZE, header_layouts.SIZE), [(a, b) for a in range(4) for b in range(4 - a)]
+    common = np.random.default_rng((5, 1)).normal(0, 0.3 / 2, (10, 2))
+    x, y, weights = basis.quadrature(6)
+    f = basis.denormalize(x, y, shape) + header_layouts.CORNERS[header_layouts.KEYS.index(key)]
+    t = f / header_layouts.MIDDLE - 1
+    moved = np.stack([t[:, 0] ** a * t[:, 1] ** b for a, b in powers], axis=1) @ common
+    modes = (weights * basis.values(3, x, y) @ moved).T
+    rows = detector_modes.dynamic_basis(shape, 10)
+    return (rows.T @ (rows @ modes.ravel())).reshape(2, -1)
+
+
+def test_what_was_found_beyond_the_headers_has_its_shear(night, first, tmp_path):
+    """With errors, by the solution and by the file of its camera alike."""
+    _, exposures = visit(night, 0)
+    stated = ld.Camera.from_exposures([each for each in exposures if each.exposure == "e0"])
+    found, pulls = ld.difference(stated, first), []
+    assert found.n_undetermined == 0
+    for key in header_layouts.KEYS:
+        assert np.isfinite(found.errors[key]).all()
+        pulls.append(((found.coefficients[key] - shared_on(key)) / np.maximum(found.errors[key], 1e-9))[:, 1:])
+    assert np.mean(np.square(pulls)) == pytest.approx(1, abs=0.7)
+    by_file = ld.difference(stated, ld.Camera.read(first.camera.write(tmp_path / "camera.asdf")))
+    for key in header_layouts.KEYS:
+        assert by_file.coefficients[key] == pytest.approx(found.coefficients[key], abs=1e-4)
+        assert 0 < by_file.errors[key][0, 1] < 0.05
+    assert ld.difference(first.camera, first).rms < 1e-6
+
+
+def test_directions_that_are_not_determined_are_named(night):
+    alone = ld.solve(matched(night, 0), static="fit", prior=EVIDENCE)
+    found = ld.difference(ld.Camera.from_exposures([e for e in night.exposures if e.exposure == "e0"]), alone)
+    assert found.undetermined[0].startswith("shear")
+    assert f"{found.n_undetermined} directions (shear" in found.sentence
