@@ -13,8 +13,7 @@ from ..geometry import basis, detector_modes
 from ..geometry.similarity import apply, invert
 from ..matching.matches import Matches
 from ..priors.prior import Prior
-from ..results.errors import absolute_errors
-from ..results.errors.coefficient_covariance import mean_covariance
+from ..results.errors.common_distortion import NOTHING, common_distortion
 from ..results.solution import Solution
 from ..solving import single_fit
 from ..solving.equations.reduced_system import DIRECT_LIMIT
@@ -29,7 +28,7 @@ from ..solving.options import SolveOptions
 MEAN_SQUARE = 8
 #: Information [pix^-2] from which a direction is determined: its error is 0.3 px at most, rms per axis over a detector.
 DETERMINED = 1 / (MEAN_SQUARE * 0.3**2)
-_NOTHING, _FREE = 1e4, 1e3  # error of a coefficient of which nothing is known, and where digits count [pix]
+_FREE = 1e3  # error of a coefficient of which nothing is known where digits count [pix]
 _ROUNDS = 3
 _KEPT = "loss", "motion", "motion_sigma", "motion_epoch", "night_sigma"  # settings of a night
 _MOST = 500  # coefficients from which the scatter of exposures is found
@@ -97,9 +96,9 @@ def known_map(thing, label, other=None):
 def _stated(thing):
     """Covariance of the coefficients of a prior, or of a detector that is no part of a focal plane; None without."""
     if thing.static_covariance is not None:
-        return np.where(np.isinf(thing.static_covariance), _NOTHING**2, thing.static_covariance)
+        return np.where(np.isinf(thing.static_covariance), NOTHING**2, thing.static_covariance)
     widths = thing.static_sigma
-    return None if widths is None else np.diag(np.minimum(widths.ravel(), _NOTHING) ** 2)
+    return None if widths is None else np.diag(np.minimum(widths.ravel(), NOTHING) ** 2)
 
 
 def _of_nights(nights, label):
@@ -111,11 +110,14 @@ def _of_nights(nights, label):
 def _of_camera(camera, label, common=None):
     """The detectors of a camera, the shear of whose layouts is a part of their maps.
 
-    One that was found from exposures knows nothing of a map that all its detectors share, which these took over: it is
-    taken as the `common` one (2, n) of what it is compared with.
+    One that was found from exposures knows nothing of a map that all its detectors share, which these took over, unless
+    a reference told it: it is taken as the `common` one (2, n) of what it is compared with.
     """
     statics = {key: map_alone(each)[1] for key, each in camera.detectors.items()}
-    n = _n_found(camera)
+    n, sigma = _n_found(camera), NOTHING
+    if camera.common_map is not None:
+        n = camera.common_map.shape[1]
+        common, sigma = camera.common_map, np.minimum(camera.common_sigma.ravel(), NOTHING)
     if n and common is not None:
         statics = {key: _whole(camera, each, common[:, :n]) for key, each in camera.detectors.items()}
     shapes = {key: each.shape for key, each in camera.detectors.items()}
@@ -125,13 +127,13 @@ def _of_camera(camera, label, common=None):
         covariance = _stated(detector)
     elif any(each is not None for each in widths):
         widths = [widths_alone(each, statics[key].shape[1]) for key, each in camera.detectors.items()]
-        covariance = np.diag(np.concatenate([np.minimum(each.ravel(), _NOTHING) ** 2 for each in widths]))
+        covariance = np.diag(np.concatenate([np.minimum(each.ravel(), NOTHING) ** 2 for each in widths]))
         if n:
             maps = [_common_maps(camera, each, n).reshape(2, n, -1) for each in camera.detectors.values()]
             whole = [np.pad(each, ((0, 0), (0, max(w.shape[1] - n, 0)), (0, 0)))[:, : w.shape[1]]
                      for each, w in zip(maps, widths, strict=True)]  # fmt: skip
             shared = np.concatenate([each.reshape(-1, 2 * n) for each in whole])
-            covariance += _NOTHING**2 * shared @ shared.T
+            covariance += (sigma * shared) @ (sigma * shared).T
     return KnownMap(camera.name if label.startswith("the ") else label, statics, shapes, covariance)
 
 
@@ -145,7 +147,10 @@ def _n_found(camera):
 
 
 def _of_focal_plane(solution, label):
-    """The detectors of a camera that was fitted, with what its exposures have in common; layouts are free."""
+    """The detectors of a camera that was fitted, with what its exposures have in common.
+
+    Of layouts that were held nothing is known, nor of what nothing determined of those that were fitted.
+    """
     errors, camera = solution.estimate.uncertainty.camera, solution.camera
     if errors is None or not errors.free[:, :, 3:].any():
         raise InputError(
@@ -156,11 +161,13 @@ def _of_focal_plane(solution, label):
     n = int(np.flatnonzero(errors.free.any(axis=(0, 1))).max()) + 1  # what is beyond was given, and not asked
     free = errors.free[:, :, :n]
     common = np.concatenate([_common_maps(camera, each, n) for each in camera.detectors.values()])
-    mean, covariance, shared = _of_exposures(solution, n)
+    mean, covariance, shared = common_distortion(solution, n)
     moved = common @ shared
     moved[free.ravel()] += errors.changes
-    unseen = ~free | (np.arange(n) < 3)
-    covariance = common @ covariance @ common.T + moved @ moved.T + np.diag(_NOTHING**2 * unseen.ravel())
+    unseen = ~free
+    unseen[:, :, :3] |= [np.isinf(each.layout_sigma) if each.layout_sigma is not None else np.ones((2, 3), dtype=bool)
+                         for each in camera.detectors.values()]  # fmt: skip
+    covariance = common @ covariance @ common.T + moved @ moved.T + np.diag(NOTHING**2 * unseen.ravel())
     degree, common = basis.degree_of(n), mean.reshape(2, n)
     statics = {key: pointed(_whole(camera, each, common), each.shape) for key, each in camera.detectors.items()}
     statics = {key: basis.change_degree(each, degree) for key, each in statics.items()}
@@ -181,32 +188,6 @@ def _whole(camera, detector, common):
     return basis.project(displacement, degree)
 
 
-def _of_exposures(solution, n):
-    """What exposures and a reference tell of a common map of the focal plane, in n modes per axis.
-
-    Nothing without a reference: where detectors share a map, exposures can take it over.
-
-    Returns
-    -------
-    mean : ndarray, shape (2 n,)
-    covariance : ndarray, shape (2 n, 2 n)
-    shared : ndarray, shape (2 n, r)
-        Responses to the errors of the camera.
-    """
-    gauge, uncertainty = solution.gauge, solution.estimate.uncertainty
-    shared = uncertainty.camera.coefficients.mean(axis=0)
-    size = len(shared) // 2
-    if gauge.tie is None:
-        return np.zeros(2 * n), _NOTHING**2 * np.eye(2 * n), np.zeros((2 * n, shared.shape[1]))
-    moved = absolute_errors.known_changes(gauge, size).mean(axis=0)
-    unknown = _NOTHING * absolute_errors.unknown_changes(gauge, size).mean(axis=1)
-    covariance = mean_covariance(uncertainty.coefficients, len(solution.names)) + unknown.T @ unknown
-    covariance += moved @ absolute_errors.known_covariance(gauge) @ moved.T
-    rows = np.kron(np.eye(2), np.eye(n, size))
-    mean = solution.coefficients[:, :, :size].mean(axis=0)
-    return rows @ mean.ravel(), rows @ covariance @ rows.T, rows @ shared
-
-
 def _common_maps(camera, detector, n):
     """Coefficients (2 n, 2 n) on a detector of the modes of the focal plane."""
     degree, back = basis.degree_of(n), invert(detector.layout)
@@ -223,7 +204,7 @@ def _of_night(solution, label, other):
     """The static distortion of the exposures of one detector, from all but what was known of it."""
     night = shown_by(solution, label, other)
     sizes, vectors = np.linalg.eigh(night.information)
-    covariance = vectors / np.maximum(sizes, _NOTHING**-2) @ vectors.T
+    covariance = vectors / np.maximum(sizes, NOTHING**-2) @ vectors.T
     rows = detector_modes.dynamic_basis(night.shape, night.around.shape[1])
     return KnownMap(label, {"1": night.around}, {"1": night.shape}, rows.T @ covariance @ rows, night.dof, night.degree)
 

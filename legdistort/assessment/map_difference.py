@@ -62,6 +62,8 @@ class MapDifference(ShownAsPrinted):
         Rms of the difference that the errors let expect, per axis, pixels; NaN where none is stated.
     n_undetermined : int
         Directions that are not determined to 0.3 px, rms per axis, and do not count.
+    undetermined : tuple of str
+        What these are, of modes that are mostly in them: shear, degree 2, ...; by detector where there are several.
     left_out : tuple of str
         Detectors that one has alone, where the other is a map of one that its file names.
     shared : tuple of str
@@ -82,6 +84,7 @@ class MapDifference(ShownAsPrinted):
     p: float
     rms_error: float = np.nan
     n_undetermined: int = 0
+    undetermined: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
     shared: tuple[str, ...] = ()
     stars: StarDifference | None = None
@@ -148,7 +151,9 @@ class MapDifference(ShownAsPrinted):
             )
         if not self.dof:
             return f"{second} determines nothing of {first}: give exposures at several rolls, or dithers"
-        aside = f"; {self.n_undetermined} directions are not determined and do not count" * (self.n_undetermined > 0)
+        which = f" ({', '.join(self.undetermined)})" * bool(self.undetermined)
+        aside = f"; {self.n_undetermined} directions{which} are not determined and do not count"
+        aside *= self.n_undetermined > 0
         found = f"chi2 {self.chi2:.1f} for {self.dof}, p = {self.p:.2g}{aside}"
         if self.agrees:
             which = first if first.startswith("the ") else f"the map of {first}"
@@ -314,8 +319,22 @@ def _of_maps(one, two):
     size = float(np.sqrt(np.sum(power[determined]) / MEAN_SQUARE / len(pairs))) if stated else np.nan
     return MapDifference(
         (one.label, two.label), found, own, shapes, chi2, k if stated else 0, p if stated else np.nan, size,
-        int(np.count_nonzero(~determined)), left_out=tuple(dict.fromkeys(left_out)),
+        int(np.count_nonzero(~determined)), _named(inside, [pair[0] for pair in pairs], n),
+        left_out=tuple(dict.fromkeys(left_out)),
     )  # fmt: skip
+
+
+def _named(inside, detectors, n):
+    """Names of the rows of detectors, those of `detector_modes.dynamic_basis` each, that are mostly not `inside`."""
+    names = ["shear" if degree < 2 else f"degree {degree}" for degree in detector_modes.dynamic_degrees(n)]
+    lost = (1 - np.sum(inside**2, axis=1)).reshape(len(detectors), -1) > 0.5
+    found = {}
+    for name in dict.fromkeys(names):
+        mine = lost[:, np.array(names) == name].any(axis=1)
+        of = "" if mine.all() else f" of {', '.join(np.array(detectors)[mine])}"
+        if mine.any():
+            found[f"{name}{of}"] = None
+    return tuple(found)
 
 
 def _ends(first, second):

@@ -8,6 +8,7 @@ exposure adds to them is a distortion of the focal plane as a whole.
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,7 +32,7 @@ from ..runtime.trees import codec
 from ..runtime.trees.facts import SIZE, array, keyed
 from . import storage
 from .detector import Detector
-from .from_wcs import camera_of, layouts_of
+from .from_wcs import camera_of, fullest, header_map, moved_plane, stated_detectors
 from .header_layout import HeaderLayout, compare_headers
 from .source import check_shape
 
@@ -43,6 +44,11 @@ if TYPE_CHECKING:
     from ..inputs.exposures import Exposure
     from ..runtime.annotations import Shape, StrPath
 
+log = logging.getLogger(__name__)
+
+#: Headers have detectors alike that agree to this [pix] after one similarity: those of one reference file do so to
+#: 1e-4 px, the rounding of FITS headers aside, and headers with what a solution found differ by more.
+SAME_OPTICS = 0.02
 #: Detectors may lie on each other by this part of their area: layouts to begin with are not exact.
 OVERLAP = 0.05
 #: Name of the camera of plain images.
@@ -78,11 +84,18 @@ class Camera(ShownAsPrinted):
         modes in pixels, beside that of each detector; infinite where nothing is known. It is a degeneracy: exposures do
         not distinguish it from one of their own, so that layouts and static distortions found from them do not contain
         it. None: no such uncertainty.
+    common_map : array_like, shape (2, n_modes), optional
+        That distortion, as exposures had it that a reference tied to the sky: normalised Legendre modes of the focal
+        plane, pixels, known to `common_sigma`. It is the static distortion of the focal plane from which further
+        exposures depart. None: no reference has told it.
+    header_map : array_like, shape (2, 3), optional
+        Similarity from the plane of the `header_layout` of the detectors to the focal plane: with a `common_map` as the
+        sky was found, which carries scale and rotation to headers of further exposures, else as the layouts have it.
 
     Raises
     ------
     InputError
-        For no detector, detectors that lie on each other, or outside of the field.
+        For no detector, detectors that lie on each other, or outside of the field; a `common_map` without its errors.
 
     See Also
     --------
@@ -105,6 +118,8 @@ class Camera(ShownAsPrinted):
     common_sigma: np.ndarray | None = stored(
         default=None, metadata=array(2, "modes", unit="pix", minimum=0, infinite=True)
     )
+    common_map: np.ndarray | None = stored(default=None, metadata=array(2, "modes", unit="pix"))
+    header_map: np.ndarray | None = stored(default=None, metadata=array(2, 3, unit="pix", invertible=True))
 
     def __post_init__(self) -> None:
         if not isinstance(self.detectors, dict) or not self.detectors:
@@ -119,6 +134,9 @@ class Camera(ShownAsPrinted):
         first, *others = detectors.values()
         field = first.shape if self.field is None and first.is_plain and not others else self.field
         object.__setattr__(self, "common_sigma", _common(self.common_sigma))
+        object.__setattr__(self, "common_map", _common_map(self.common_map, self.common_sigma))
+        if self.header_map is not None:
+            object.__setattr__(self, "header_map", similarity.check(self.header_map, "header_map"))
         if first.is_plain and not others and self.common_sigma is None and field == first.shape:
             object.__setattr__(self, "detectors", detectors)
             object.__setattr__(self, "field", field)
@@ -170,6 +188,11 @@ class Camera(ShownAsPrinted):
     def is_known(self) -> bool:
         """Whether there is more to it than plain images have: a focal plane, a name, or a static distortion."""
         return self.has_focal_plane or self.name != IMAGE or self.states_static or list(self.detectors) != ["1"]
+
+    @property
+    def states_scale(self) -> bool:
+        """Whether a reference told how the sky of headers of its kind lies in the focal plane (`header_map`)."""
+        return self.common_map is not None and self.header_map is not None
 
     @property
     def states_static(self) -> bool:
@@ -402,7 +425,7 @@ class Camera(ShownAsPrinted):
         exposures : list of Exposure
             Of the same camera, with `exposure` and `detector`.
         """
-        return cls.from_exposures(_fullest(exposures))
+        return cls.from_exposures(fullest(exposures))
 
     def with_headers(self, exposures: Sequence[Exposure]) -> Camera:
         """The camera with the `header_layout` of its detectors by that of several exposures which has most of them.
@@ -412,12 +435,34 @@ class Camera(ShownAsPrinted):
         exposures : list of Exposure
             Of detectors of this camera, with `exposure` and `detector`. Those without a WCS state nothing.
         """
-        named = {each.detector: each for each in _fullest([each for each in exposures if each.wcs is not None])}
-        stated = layouts_of(named) if len(named) > 1 and self.has_focal_plane else {}
-        layouts = {key: stated[key][1] if key in stated else None for key in self.detectors}
-        return replace(
-            self, detectors={k: replace(each, header_layout=layouts[k]) for k, each in self.detectors.items()}
+        stated = stated_detectors(exposures) if self.has_focal_plane else {}
+        layouts = {key: stated[key].header_layout if key in stated else None for key in self.detectors}
+        detectors = {k: replace(each, header_layout=layouts[k]) for k, each in self.detectors.items()}
+        camera = replace(self, detectors=detectors, header_map=None)
+        if not stated:
+            return camera
+        known = self._carried(stated) if self.states_scale else header_map(camera, stated)
+        return replace(camera, header_map=known)
+
+    def _carried(self, stated):
+        """The `header_map` for headers that have detectors otherwise turned or shifted as a whole; None for others.
+
+        `stated` are ``{id: Detector}`` by these headers.
+        """
+        if sum(self[key].header_layout is not None for key in stated) > 1:
+            step, off = moved_plane(stated, self.detectors)
+            if off < SAME_OPTICS:
+                return similarity.compose(self.header_map, step)
+            words = f"have its detectors {off:.2g} px otherwise"
+        else:
+            words = "do not have two of its detectors"
+        log.warning(
+            "the headers %s than those with which a reference tied camera %s: scale and rotation on the sky are as "
+            "these headers state them",
+            words,
+            self.name,
         )
+        return None
 
     @cached_property
     def headers(self) -> HeaderLayout | None:
@@ -479,14 +524,6 @@ class Camera(ShownAsPrinted):
         return storage.read_camera(path, cls)
 
 
-def _fullest(exposures):
-    """The detectors of the exposure that has most, of a list of `Exposure`; empty of none."""
-    parts = {}
-    for exposure in exposures:
-        parts.setdefault(exposure.exposure, []).append(exposure)
-    return max(parts.values(), key=len, default=[])
-
-
 def _common(sigma):
     """`common_sigma` as an array (2, n_modes), or None."""
     if sigma is None:
@@ -498,6 +535,18 @@ def _common(sigma):
         )
     basis.degree_of(out.shape[1])  # refuses a number that is none of modes
     return out
+
+
+def _common_map(coefficients, sigma):
+    """`common_map` as an array (2, n_modes) of as many modes as its errors have; None as None."""
+    if coefficients is None:
+        return None
+    out = np.array(coefficients, dtype=float)
+    if out.ndim != 2 or len(out) != 2 or not np.isfinite(out).all():
+        raise InputError(f"common_map must be finite numbers (2, n_modes), pixels, got {coefficients!r}")
+    if sigma is None or sigma.shape[1] < out.shape[1]:
+        raise InputError("common_map needs the errors of all of its modes: give common_sigma (2, n_modes)")
+    return basis.change_degree(out, basis.degree_of(sigma.shape[1]))
 
 
 def _shifted(detector, first):

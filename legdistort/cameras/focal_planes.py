@@ -6,10 +6,9 @@ import numpy as np
 from astropy.io import fits
 from astropy.wcs import WCS
 
-from ..geometry import basis, similarity, tangent_plane
+from ..geometry import similarity, tangent_plane
 from ..inputs.sky_wcs import to_icrs
-
-_GRID = np.linspace(-1, 1, 5)
+from .from_wcs import grid_of, stated_detectors
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,20 +59,28 @@ def focal_planes(camera, exposures):
     for exposure in exposures:
         camera.check(exposure)
         planes.setdefault(exposure.exposure, []).append(exposure)
-    return [FocalPlane(name, camera.field, _wcs(camera, parts), parts[0].header) for name, parts in planes.items()]
+    stated = stated_detectors(exposures) if camera.states_scale else {}
+    return [
+        FocalPlane(name, camera.field, _wcs(camera, parts, stated), parts[0].header) for name, parts in planes.items()
+    ]
 
 
-def _wcs(camera, parts):
+def _wcs(camera, parts, stated):
     """The linear WCS of the focal plane that fits those of its detectors best, or None if they have none.
 
-    A detector whose header contradicts those of the others has no part in it.
+    A detector whose header contradicts those of the others has no part in it. Where a reference told how the plane lies
+    in which headers have the detectors, `stated` ``{id: Detector}``, pixels are where the headers have them.
     """
     places, sky, odd = [], [], () if camera.headers is None else camera.headers.odd
     known = [part for part in parts if part.wcs is not None]
     for part in known:
         if part.detector not in odd or all(each.detector in odd for each in known):
-            xy = basis.denormalize(*(a.ravel() for a in np.meshgrid(_GRID, _GRID)), part.shape)
-            places.append(camera[part.detector].to_focal_plane(xy))
+            xy, of_header = grid_of(part.shape), stated.get(part.detector)
+            places.append(
+                camera[part.detector].to_focal_plane(xy)
+                if of_header is None
+                else similarity.apply(camera.header_map, of_header.to_focal_plane(xy))
+            )
             sky.append(to_icrs(part.wcs, xy))
     if not places:
         return None

@@ -5,6 +5,8 @@ focus. Its pixels have the mean size of those of the detectors, and its axes the
 where the telescope pointed is left but the side of the sky that is up.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..exceptions import InputError, some_of
@@ -36,7 +38,8 @@ def camera_of(kind, exposures, name=None):
         stated = layout if len(named) > 1 else None
         known = {"static": static, "layout_sigma": sigma, "header_layout": stated}
         detectors[key] = Detector(named[key].shape, layout=layout, **known)
-    return kind(name or str(first.header.get("INSTRUME", "camera")).strip() or "camera", detectors)
+    camera = kind(name or str(first.header.get("INSTRUME", "camera")).strip() or "camera", detectors)
+    return replace(camera, header_map=header_map(camera, detectors)) if len(named) > 1 else camera
 
 
 def layouts_of(named):
@@ -47,6 +50,60 @@ def layouts_of(named):
     found = {key: _expanded(each, centre) for key, each in named.items()}
     plane = _focal_plane([pose for _, pose in found.values()])
     return {key: (static, similarity.compose(pose, plane)) for key, (static, pose) in found.items()}
+
+
+def stated_detectors(exposures):
+    """``{id: Detector}`` by the headers of that of several exposures which has most of them, in one plane.
+
+    Of fewer than two detectors with a WCS none: these are in no plane together.
+    """
+    named = {each.detector: each for each in fullest([each for each in exposures if each.wcs is not None])}
+    return {
+        key: Detector(named[key].shape, layout=layout, static=static, header_layout=layout)
+        for key, (static, layout) in (layouts_of(named) if len(named) > 1 else {}).items()
+    }
+
+
+def fullest(exposures):
+    """The detectors of the exposure that has most, of a list of `Exposure`; empty of none."""
+    parts = {}
+    for exposure in exposures:
+        parts.setdefault(exposure.exposure, []).append(exposure)
+    return max(parts.values(), key=len, default=[])
+
+
+def header_map(camera, stated):
+    """Similarity (2, 3) from the plane in which headers have ``{id: Detector}`` to the focal plane of a camera.
+
+    It fits where both have pixels all over the detectors best, those aside whose header contradicts the others.
+    """
+    odd = () if camera.headers is None else camera.headers.odd
+    known = [key for key in stated if key not in odd] or list(stated)
+    pixels = {key: grid_of(stated[key].shape) for key in known}
+    there = np.concatenate([stated[key].to_focal_plane(pixels[key]) for key in known])
+    here = np.concatenate([camera[key].to_focal_plane(pixels[key]) for key in known])
+    return similarity.invert(similarity.fit_similarity(here, there))
+
+
+def moved_plane(new, old):
+    """Similarity from the plane of the header layouts of new ``{id: Detector}`` to that of old, what it leaves [pix].
+
+    The latter is the largest distance, over the corners of the detectors that both have.
+    """
+    both = [key for key in new if old[key].header_layout is not None]
+    pixels = {key: basis.denormalize(*np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]]), new[key].shape) for key in both}
+    new, old = (
+        np.concatenate([similarity.apply(similarity.invert(each[key].header_layout), pixels[key]) for key in both])
+        for each in (new, old)
+    )
+    step = similarity.fit_similarity(new, old)
+    return step, float(np.hypot(*(similarity.apply(step, new) - old).T).max())
+
+
+def grid_of(shape):
+    """Pixels (25, 2) all over a detector."""
+    t = np.linspace(-1, 1, 5)
+    return basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), shape)
 
 
 def _by_detector(exposures):

@@ -221,7 +221,7 @@ def sky_by_layout(matches, found, poses):
     """Where the reference plane lies on the sky, with detectors where they were found.
 
     The plane is put on the sky by headers, which have the detectors elsewhere: those that agree on where count, one
-    that contradicts them does not.
+    that contradicts them does not. It stays where a reference told how the focal plane lies in that of the headers.
 
     Parameters
     ----------
@@ -236,11 +236,34 @@ def sky_by_layout(matches, found, poses):
     `~legdistort.geometry.tangent_plane.TangentPlane`
     """
     before = matches.camera.headers
-    if before is None or found is None:
+    if before is None or found is None or matches.camera.states_scale:
         return matches.sky
     back = similarity.compose(before.similarity, similarity.invert(found.similarity))
     moves = [similarity.compose(similarity.invert(pose), similarity.compose(back, pose)) for pose in poses]
     return replace(matches.sky, matrix=similarity.compose(matches.sky.matrix, np.mean(moves, axis=0)))
+
+
+def header_map_by(matches, poses, sky):
+    """The `Camera.header_map` with the focal plane where a solution has it on the sky; None without the headers'.
+
+    Parameters
+    ----------
+    matches : Matches
+        As headers have them: with a sky, poses and a `header_map` by these.
+    poses : dict
+        ``{exposure: (2, 3)}``, from the reference plane of the solution to its focal plane.
+    sky : `~legdistort.geometry.tangent_plane.TangentPlane` or None
+        Where that reference plane lies.
+    """
+    camera = matches.camera
+    if camera.header_map is None or matches.sky is None or sky is None:
+        return None
+    back, corners, by_header = similarity.invert(camera.header_map), _grid(camera.field, 2), []
+    for name, pose in poses.items():
+        places = sky.to_sky(similarity.apply(similarity.invert(pose), corners))
+        there = similarity.apply(matches.poses[name], matches.sky.from_sky(places))
+        by_header.append(similarity.apply(back, there))
+    return similarity.fit_similarity(np.concatenate(by_header), np.tile(corners, (len(poses), 1)))
 
 
 def _grid(shape, n):

@@ -58,7 +58,8 @@ def _pointing(solution):
         return None
     off = [{"name": name, "off_px": pixels, "turned_deg": turn} for name, (pixels, turn) in found.off.items()]
     return {
-        "n_used": found.n_used, "err_mas": _plain(1000 * scale * found.shift), "rotation_err_deg": _plain(found.turn),
+        "n_used": found.n_used,
+        "least_err_mas": _plain(1000 * scale * found.shift), "least_rotation_err_deg": _plain(found.turn),
         "contradicting": off, "groups": [list(group) for group in found.groups],
     }  # fmt: skip
 

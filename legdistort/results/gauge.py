@@ -45,6 +45,11 @@ _STATIC = {
 }
 _ROWS = array("n_constraints", "n_exposures", "2 n_map_modes")
 CURE = "give a prior (--prior) or its size (--static-sigma), turn the camera between exposures, or tie to a reference"
+#: The same of several detectors, whose static distortions are those of their camera: a prior is refused.
+CURE_OF_CAMERA = (
+    "match with the camera of a solution that a reference tied (match --camera RESULTS), turn the camera between "
+    "exposures, or tie to a reference (--reference)"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -507,6 +512,13 @@ class Gauge(ShownAsPrinted):
             + ("No external reference was used." if self.tie is None else self.tie.statement)
         )
         return "\n".join(lines)
+
+
+def warning_of(solution):
+    """The `Gauge.warning` of a solution, with what to do about one of a camera with several detectors."""
+    of_camera = solution.camera.has_focal_plane or solution.settings.dynamic == "detector"
+    warning = solution.gauge.warning
+    return warning.replace(CURE, CURE_OF_CAMERA) if of_camera else warning
 
 
 def in_words(names):

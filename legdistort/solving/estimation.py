@@ -14,10 +14,13 @@ import numpy as np
 from ..cameras import ties
 from ..cameras.exchanged import check_places
 from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, SolveError, by_reason, some_of, warn
-from ..matching.header_poses import sky_by_layout
+from ..geometry import basis
+from ..matching.header_poses import header_map_by, sky_by_layout
 from ..matching.matches import Matches
-from ..priors.prior import Prior, has_distortion
+from ..priors.prior import UNSTATED, Prior, has_distortion
 from ..results.diagnostics import Diagnostics
+from ..results.errors.common_distortion import with_common_map
+from ..results.gauge import warning_of
 from ..results.settings import Settings
 from ..runtime.guards.units import plain_numbers
 from . import minimisers, model_forms, reference_tie, single_fit, star_motions
@@ -275,14 +278,23 @@ def solve(
     epoch = given.epoch if epoch is None else epoch
     sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
     found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue), epoch=epoch)
-    solution = _solution(fit, scale, _settings(asked, options, form), found, form)
-    if solution.gauge.warning:
-        log.warning("%s", solution.gauge.warning)
+    solution = _with_camera(_solution(fit, scale, _settings(asked, options, form), found, form), given)
+    if words := warning_of(solution):
+        log.warning("%s", words)
     if kept_out is None:
         return solution
     if sought is not None:
         kept_out = solution.camera.in_focal_plane(matches.camera.on_detectors(kept_out))
     return replace(solution, diagnostics=replace(found, validation=validation(solution, kept_out, validate)))
+
+
+def _with_camera(solution, given):
+    """The solution whose camera has what a reference told of its focal plane, for exposures of another field."""
+    camera = with_common_map(solution.camera, solution)
+    if camera.has_focal_plane and solution.gauge.n_fields == 1:
+        found = header_map_by(given, solution.poses, solution.sky)
+        camera = camera if found is None else replace(camera, header_map=found)
+    return replace(solution, camera=camera)
 
 
 def solution_of(fit, asked, **settings):
@@ -348,15 +360,21 @@ def _of_camera(matches, prior, model, degree, layout, static, exposure_degree):
             "detector by itself (dynamic='detector', --dynamic detector), or give the series alone "
             "(dataclasses.replace(prior, table=None))"
         )
+    widths = common_widths(camera, sought)
+    of_plane = {"source": f"camera {camera.name}"}
+    if camera.common_map is not None:
+        mean = basis.change_degree(camera.common_map, basis.degree_of(widths.shape[1]))
+        of_plane |= {"mean": mean, "static_sigma": widths}
+        if prior is not None and prior.source == UNSTATED:
+            return sought, replace(prior, **of_plane)
     if prior is not None or model is not None:
         return sought, prior
     # nothing known of it is not the same as none; of detectors that no star ties their layout is all that holds them
     if static is None and not camera.states_static and len(camera.groups(matches.table)) == 1:
         return sought, None
-    known, widths = {"source": f"camera {camera.name}"}, common_widths(camera, sought)
     if widths is None:
-        return None, Prior(np.zeros((2, 1)), **known)
-    return sought, Prior(np.zeros_like(widths), static_sigma=widths, **known)
+        return None, Prior(np.zeros((2, 1)), **of_plane)
+    return sought, Prior(**{"mean": np.zeros_like(widths), "static_sigma": widths} | of_plane)
 
 
 def _of_detector(camera, prior, model):

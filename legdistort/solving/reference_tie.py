@@ -454,7 +454,10 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
     lost = len(reference) - len(there)
     why = f"; {lost} are left out: they have no proper motion with errors to take them to {epoch or 0:.2f}"
     missing = identified.missing if fit.problem.n_fields == 1 else ()
-    told = f"; {len(missing)} more lie among them and are not found: {some_of(missing, 6)}" * bool(missing)
+    told = (
+        f"; {len(missing)} more lie among them and are not found, too faint or in fewer exposures than match asks for "
+        f"(min_exposures): {some_of(missing, 6)}"
+    ) * bool(missing)
     log.info(
         "%d of the %d stars of %s are in the exposures%s%s",
         len(identified.rows), len(reference), reference.label, told, why * bool(lost),

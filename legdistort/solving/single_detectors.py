@@ -9,6 +9,7 @@ from ..cameras.header_layout import compare_headers
 from ..exceptions import AssumptionWarning, warn
 from ..geometry import basis, similarity
 from ..inputs.exposure_names import detector_name
+from ..matching.fields import apart
 from ..priors.prior import Prior
 
 
@@ -50,6 +51,13 @@ def by_detector(matches, static):
         camera=None,
         start=None,
     )
+    if len(groups := made.observations.groups) > 1:
+        raise apart(
+            groups,
+            "each can be matched and solved by itself, from the frames or star lists of its detectors alone; all "
+            "detectors together are solved with a distortion of the focal plane: leave dynamic='detector' (--dynamic "
+            "detector) out",
+        )
     made.observations.check()
     return made, {key: prior for key, (_, prior) in own.items()}
 

@@ -166,7 +166,7 @@ def test_undetermined_directions_do_not_count():
     found = ld.difference(old(6), solution)
     assert found.n_undetermined >= 2
     assert found.agrees
-    assert "directions are not determined and do not count" in found.sentence
+    assert f"{found.n_undetermined} directions (shear, degree 2) are not determined and do not count" in found.sentence
     turned = ld.difference(old(6), solved(6, of=off + 0.3 * square))
     assert turned.agrees is False
 
@@ -246,7 +246,11 @@ def test_a_night_of_a_camera_is_compared_detector_by_detector():
     night = ld.solve(matches, static="fit", layout="fit", degree=2)
     right, wrong = ld.difference(four(1), night), ld.difference(four(1, extra=0.2), night)
     assert right.agrees
-    assert right.n_undetermined == 14  # of eight shears, which layouts have, and a common quadratic of the plane
+    assert right.n_undetermined == 9  # of a common map of the plane, shear and quadratic, and how it changes the scale
+    assert right.undetermined == ("shear",)
+    ax = right.plot()
+    assert "9 directions are not determined, and not drawn" in ax.get_title(loc="left")
+    pyplot.close(ax.figure)
     assert 0.002 < right.rms < 0.02
     assert wrong.sigmas > 8
     assert "mostly in L1(x) L1(y) along x of detector 1 (-0.1" in wrong.sentence
@@ -268,7 +272,7 @@ def tied(seed, error=0.05):
 
 
 def test_what_a_reference_tells_of_a_camera_counts():
-    """What all detectors share, exposures can take over: 6 directions more are not determined without a reference."""
+    """What all detectors share, exposures can take over: a shear and a quadratic map, with a reference all is told."""
     night = tied(2)
     bent = four(2)
     for key, chip in bent.detectors.items():
@@ -276,17 +280,14 @@ def test_what_a_reference_tells_of_a_camera_counts():
         more[0, 3] += 0.15
         bent.detectors[key] = ld.Detector(chip.shape, layout=chip.layout, static=more)
     right, wrong = ld.difference(four(2), night), ld.difference(ld.Camera("bent", bent.detectors), night)
-    assert right.n_undetermined == 8  # shears, which layouts have
+    assert right.n_undetermined == 0
     assert right.agrees
     assert wrong.rms == pytest.approx(0.15 / np.sqrt(8), rel=0.25)
     assert wrong.sigmas > 5
-    ax = wrong.plot()
-    assert "8 directions are not determined, and not drawn" in ax.get_title(loc="left")
-    pyplot.close(ax.figure)
 
 
 def test_the_camera_of_a_night_is_that_night_in_a_file_too(tmp_path):
-    """A map that all detectors share is with the exposures, and in no camera that was found from them."""
+    """A map that all detectors share is with the exposures; the camera that a reference tied states it too."""
     night = tied(2)
     night.write(tmp_path / "night.asdf")
     night.camera.write(tmp_path / "camera.asdf")
@@ -296,7 +297,7 @@ def test_the_camera_of_a_night_is_that_night_in_a_file_too(tmp_path):
         found = ld.difference(*pair)
         assert found.agrees
         assert found.rms < 1e-7
-        assert found.n_undetermined == 14  # shears, and a common quadratic of the plane
+        assert found.n_undetermined == 0
     chips = dict(night.camera.detectors)
     chips["1"] = replace(chips["1"], static=chips["1"].static + np.eye(2, 6, 3) * 0.2)
     assert ld.difference(replace(night.camera, detectors=chips), night).sigmas > 8

@@ -111,7 +111,7 @@ def test_pointing_is_as_uncertain_as_the_mean_of_headers():
         assert (made.n_used, made.off, made.sentence) == (len(SHIFTS), {}, "")
     assert_allclose(np.mean(np.square(off), axis=0), np.mean(np.square(said), axis=0), rtol=0.3)
     assert np.isnan(told([pose(SHIFTS[0])]).shift)
-    assert "known to 100 mas" in ld.results.errors.header_pointing.HeaderPointing(2, 1.0, 0.1).error(0.1)
+    assert "is 100 mas per axis at least" in ld.results.errors.header_pointing.HeaderPointing(2, 1.0, 0.1).error(0.1)
 
 
 def test_headers_turned_by_180_degrees_are_named_so():
@@ -138,7 +138,11 @@ def test_where_no_majority_agrees_the_groups_are_named():
 
 
 def test_what_absolute_errors_leave_out_of_a_sky_by_headers():
-    """Pointing and rotation by their scatter, and the scale, in which headers of one instrument do not scatter."""
+    """Pointing and rotation, at least by their scatter, and the scale, in which headers of one instrument have none."""
     words = HeaderPointing(5, 0.5, 0.01).error(0.02)
-    assert words.startswith("their scatter leaves its pointing known to 10 mas per axis, its rotation to 0.01 deg")
-    assert words.endswith("the error of its scale, which is as they state it, ra_error_abs and dec_error_abs leave out")
+    assert words.startswith(
+        "by their scatter the error of its pointing is 10 mas per axis at least, of its rotation 0."
+    )
+    assert "what they all have wrong alike (guide stars, roll) adds to that and is not known" in words
+    assert words.endswith("leave this out, and the error of its scale, which is as they state it")
+    assert HeaderPointing(5, 0.5, 0.01).error(0.02, "NIRCAM").endswith("which is by a reference of camera NIRCAM")

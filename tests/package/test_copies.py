@@ -58,7 +58,8 @@ def detector(x, seed):
 
 def camera():
     common = np.concatenate([np.zeros((2, 3)), np.full((2, 7), 0.05)], axis=1)
-    return Camera("pair", {"a": detector(10.0, 1), "b": detector(325.0, 2)}, FIELD, common)
+    known = {"common_map": 1e-3 * (common == 0), "header_map": [[1.0, -0.01, 3.0], [0.01, 1.0, -4.0]]}
+    return Camera("pair", {"a": detector(10.0, 1), "b": detector(325.0, 2)}, FIELD, common, **known)
 
 
 def matches():
@@ -171,7 +172,11 @@ COPIES = {
 FEWER = {"table": "has fewer rows", "observations": "are those of the table"}
 PARTS = dict.fromkeys(("shapes", "poses", "left_out", "start"), "have the names of single detectors, or none")
 ANEW = {"table": "has other positions", "observations": "are those of the table"}
-PLACES = {"detectors": "lie where the exposures show them", "common_sigma": "counts what was fitted"}
+PLACES = {
+    "detectors": "lie where the exposures show them",
+    "common_sigma": "counts what was fitted",
+    "header_map": "has the focal plane where the exposures show it",
+}
 
 
 @dataclass(frozen=True)

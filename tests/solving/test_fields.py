@@ -5,6 +5,7 @@ import warnings
 import dense_model
 import drawn_sets
 import field_sets
+import header_layouts
 import numpy as np
 import pytest
 from astropy.table import Table
@@ -324,3 +325,20 @@ def test_on_the_command_line(tmp_path, capsys, monkeypatch):
     assert main(["solve", "M15.ecsv", "M92.ecsv", *words, "--static", "fit"]) == 0
     assert "fields  2 without a common star" in capsys.readouterr().out
     assert set(ld.Solution.read("r/solution.asdf").stars["field"]) - {0} == {1, 2}
+
+
+def test_fields_of_a_camera_whose_detectors_share_no_star():
+    """Dithers smaller than the gaps: nothing but the camera says how its detectors lie, in either field."""
+    night = header_layouts.Night(8, off=0.0, dither=10.0, n=8, n_stars=200, size=0.0)
+    camera = ld.Camera.from_exposures([each for each in night.exposures if each.exposure == "e0"])
+    parts = {}
+    for label, names in (("a", ("e0", "e1", "e2", "e3")), ("b", ("e4", "e5", "e6", "e7"))):
+        table = night.table[np.isin(night.table["exposure"], names)]
+        exposures = [each for each in night.exposures if each.exposure in names]
+        parts[label] = ld.match(table, exposures=exposures, camera=camera)
+    fields = ld.Matches.of_fields(parts)
+    solution = ld.solve(fields, static="hold", layout="hold", degree=2)
+    assert solution.gauge.n_fields == 2
+    assert 0.8 < solution.chi2 / solution.dof < 1.2
+    with pytest.raises(MatchError, match=r"4 groups with no star in common.* solved by itself.*leave dynamic"):
+        ld.solve(parts["a"], dynamic="detector")

@@ -1,4 +1,4 @@
-"""How well the headers tell where the plane lies on the sky, and which of them contradict the stars."""
+"""How well the headers agree on where the plane lies on the sky, and which of them contradict the stars."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ class HeaderPointing:
     n_used : int
         Exposures whose headers agree on where the plane lies; 0 where no majority does, and the sky is not known.
     shift : float
-        Error of the pointing of the plane [pix, per axis], by the scatter of these headers; NaN of a single one.
+        Least error of the pointing of the plane [pix, per axis], by the scatter of these headers, which does not show
+        what all have wrong alike; NaN of a single one.
     turn : float
         That of its rotation [degrees].
     off : dict
@@ -67,14 +68,20 @@ class HeaderPointing:
             f"{self.n_used + len(self.off)}"
         )
 
-    def error(self, pixel_scale: float) -> str:
-        """How well they tell the pointing on a sky of this scale [arcsec], in words; empty where that is not known."""
+    def error(self, pixel_scale: float, camera: str = "") -> str:
+        """What their scatter tells of their errors on a sky of this scale [arcsec], in words; empty without scatter.
+
+        That is the least that these can be: guide stars and rolls that all have wrong alike do not scatter. With the
+        name of the `camera` that has the scale, and the rotation beside the headers, from a reference.
+        """
         if not np.isfinite(self.shift):
             return ""
         error = 1000 * pixel_scale * self.shift
         size = f"{error:.2g}" if error < 100 else f"{error:.0f}"
-        turn = f", its rotation to {self.turn:.2g} deg" if np.isfinite(self.turn) else ""
+        turn = f", of its rotation {self.turn:.2g} deg" if np.isfinite(self.turn) else ""
+        scale = f"by a reference of camera {camera}" if camera else "as they state it"
         return (
-            f"their scatter leaves its pointing known to {size} mas per axis{turn}; this and the error of its scale, "
-            "which is as they state it, ra_error_abs and dec_error_abs leave out"
+            f"by their scatter the error of its pointing is {size} mas per axis at least{turn}; what they all have "
+            "wrong alike (guide stars, roll) adds to that and is not known; ra_error_abs and dec_error_abs leave this "
+            f"out, and the error of its scale, which is {scale}"
         )

@@ -20,7 +20,7 @@ _COUNT = u.adu, u.ct, u.dimensionless_unscaled
 #: Units of the arguments that have one; several that astropy does not convert mean the same.
 UNITS = {
     **dict.fromkeys(("fwhm", "tolerance", "error_floor", "night_sigma", "box", "half", "offset"), (u.pix,)),
-    **dict.fromkeys(("mean", "sigma", "static_sigma", "common_sigma", "static", "dynamic"), (u.pix,)),
+    **dict.fromkeys(("mean", "sigma", "static_sigma", "common_sigma", "common_map", "static", "dynamic"), (u.pix,)),
     **dict.fromkeys(("spectrum", "static_spectrum", "dither", "dithers", "margin", "pose_error"), (u.pix,)),
     **dict.fromkeys(("stars", "positions", "xy", "f", "errors", "parallax"), (u.pix,)),
     **dict.fromkeys(("motion", "motion_sigma"), (u.pix / u.yr,)),

@@ -16,6 +16,7 @@ from ...exceptions import reasons_of, some_of
 from ...geometry.star_hull import enclosed_area
 from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
 from ...results.errors.header_pointing import CURE as POINTING_CURE
+from ...results.gauge import warning_of
 from ..terms.observed import Observed
 from .camera_check import camera_check, contradicted_layout, undetermined
 from .cures import with_cures, without_static
@@ -330,7 +331,7 @@ def absolute_check(solution, others):
     if apart := undetermined(solution):
         return Check("absolute", "unknown", len(solution.stars), 0, f"absolute positions are not known: {apart[0]}",
                      apart[1])  # fmt: skip
-    unknown, warning = solution.gauge.unknown_names, solution.gauge.warning
+    unknown, warning = solution.gauge.unknown_names, warning_of(solution)
     if unknown:
         sentence, _, cure = warning.partition("; ")
         return Check("absolute", "unknown", len(unknown), 0, sentence, cure + _by_headers(solution, unknown))

@@ -1,0 +1,60 @@
+"""The distortion of the focal plane that all exposures of a camera have in common, as a reference determines it."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...geometry import detector_modes
+from . import absolute_errors
+from .coefficient_covariance import mean_covariance
+
+#: Error [pix] of a coefficient of which nothing is known, and where its width counts as infinite.
+NOTHING, _UNKNOWN = 1e4, 100.0
+
+
+def common_distortion(solution, n):
+    """What exposures and a reference tell of a common map of the focal plane, in n modes per axis.
+
+    Nothing without a reference: where detectors share a map, exposures can take it over.
+
+    Returns
+    -------
+    mean : ndarray, shape (2 n,)
+    covariance : ndarray, shape (2 n, 2 n)
+    shared : ndarray, shape (2 n, r)
+        Responses to the errors of the camera.
+    """
+    gauge, uncertainty = solution.gauge, solution.estimate.uncertainty
+    size = solution.coefficients.shape[2]
+    camera = uncertainty.camera
+    shared = np.zeros((2 * size, 0)) if camera is None else camera.coefficients.mean(axis=0)
+    if gauge.tie is None:
+        return np.zeros(2 * n), NOTHING**2 * np.eye(2 * n), np.zeros((2 * n, shared.shape[1]))
+    moved = absolute_errors.known_changes(gauge, size).mean(axis=0)
+    unknown = NOTHING * absolute_errors.unknown_changes(gauge, size).mean(axis=1)
+    covariance = mean_covariance(uncertainty.coefficients, len(solution.names)) + unknown.T @ unknown
+    covariance += moved @ absolute_errors.known_covariance(gauge) @ moved.T
+    rows = np.kron(np.eye(2), np.eye(n, size))
+    mean = solution.coefficients[:, :, :size].mean(axis=0)
+    return rows @ mean.ravel(), rows @ covariance @ rows.T, rows @ shared
+
+
+def with_common_map(camera, solution):
+    """The camera of a solution that a reference ties, with its `common_map` and the errors of that.
+
+    What exposures scatter about it is in the errors, so that one exposure tells nothing of it; a similarity, which
+    poses take up, is not. Other solutions have none: the camera is as it was.
+    """
+    n_exposures, _, n = solution.coefficients.shape
+    if solution.gauge.tie is None or solution.gauge.n_fields > 1 or not camera.has_focal_plane:
+        return camera
+    mean, covariance, _ = common_distortion(solution, n)
+    rows = detector_modes.dynamic_basis(camera.field, n)
+    variance = np.einsum("ka,ab,kb->k", rows, covariance, rows)
+    if n_exposures > 1:
+        scatter = solution.coefficients.reshape(n_exposures, -1) @ rows.T
+        variance += scatter.var(axis=0, ddof=1) / n_exposures
+    sigma = np.sqrt(variance) if n_exposures > 1 else np.full(len(rows), np.inf)
+    sigma = np.where(sigma < _UNKNOWN, sigma, np.inf)
+    widths = np.max(np.where(rows != 0, sigma[:, None], 0), axis=0, initial=0).reshape(2, n)
+    return replace(camera, common_map=np.where(np.isinf(widths), 0, mean.reshape(2, n)), common_sigma=widths)
