@@ -134,7 +134,11 @@ def squares(sets, date):
 
 @pytest.mark.parametrize(
     ("words", "low", "high"),
-    [({"n": 12}, 0.4, 2.2), ({"n": 16, "rate": 0.05}, 0.4, 2.2), ({"n": 12, "odd": 5}, 0.3, 2.2)],
+    [
+        ({"n": 12}, 0.4, 2.2),
+        pytest.param({"n": 16, "rate": 0.05}, 0.4, 2.2, marks=pytest.mark.slow),
+        pytest.param({"n": 12, "odd": 5}, 0.3, 2.2, marks=pytest.mark.slow),
+    ],
     ids=["constant", "drift", "odd"],
 )
 def test_sizes_are_found(words, low, high):
@@ -212,6 +216,7 @@ def test_nights_one_after_the_other_or_in_any_order_are_the_same(three):
             assert_allclose(one, two, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_nights_that_were_solved_together_speak_of_the_camera(three):
     """Their scatter is found inside, counts once, and is that of a further night; truth 0.05 px by order."""
     nights = Nights(4, nights=6, per=4, nightly=0.05, n_stars=90)
@@ -234,6 +239,7 @@ def test_nights_that_were_solved_together_speak_of_the_camera(three):
     assert_allclose(both.scatter, combined.scatter)
 
 
+@pytest.mark.slow
 def test_an_odd_night_among_others_that_were_solved_with_it_is_left_out():
     nights = Nights(4, nights=6, per=4, nightly=0.02, odd=0.5, n_stars=90)
     table = nights.table
@@ -410,6 +416,7 @@ def test_maps_that_say_nothing_are_refused(made, words):
         ld.combine_nights([made(), ld.Prior(modes(static(1)), shape=SHAPE)])
 
 
+@pytest.mark.slow
 def test_the_command(three, tmp_path, capsys):
     for i, each in enumerate(three):
         each.write(tmp_path / f"night{i}.asdf")

@@ -39,6 +39,7 @@ def columns(table, *names):
     return np.column_stack([table[name].value for name in names])
 
 
+@pytest.mark.slow
 def test_with_and_without_a_night_nothing_is_significant(tmp_path, capsys):
     nights = Nights(5, nights=6, per=3, odd=0.5, roll=0.7, n_stars=100, motion=0.05)
     whole, part = (solved(each, motion="proper") for each in (nights.table, nights.table[nights.table["block"] != 3]))
@@ -76,6 +77,7 @@ def test_with_and_without_a_night_nothing_is_significant(tmp_path, capsys):
     assert len(figures["stars"]["largest"]) == 5
 
 
+@pytest.mark.slow
 def test_differences_in_mas_where_the_pixel_scale_is_stated():
     one, two = halves(Nights(5, nights=4, per=3, n_stars=100, motion=0.05), motion="proper", pixel_scale=0.02)
     found = ld.difference(one, two).stars
@@ -105,6 +107,7 @@ def test_a_star_that_is_somewhere_else_is_named():
     assert wrong.stars.table["dx"][0].value == pytest.approx(0.3, abs=0.06)
 
 
+@pytest.mark.slow
 def test_stars_of_other_names_are_found_by_their_places():
     nights = Nights(3, nights=4, per=3, n_stars=120, roll=0.0)
     other = nights.table.copy()

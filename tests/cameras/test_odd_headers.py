@@ -58,7 +58,7 @@ def test_the_odd_one_is_found_and_measured_by_the_others(parity):
     assert re.search(words, headers.sentence("the stars put it"))
 
 
-@pytest.mark.parametrize(("n_x", "n_y"), [(2, 2), (3, 3)])
+@pytest.mark.parametrize(("n_x", "n_y"), [(2, 2), pytest.param(3, 3, marks=pytest.mark.slow)])
 def test_errors_of_how_far_it_is_off_are_those_of_drawn_headers(n_x, n_y):
     """Variances of what is stated, over those of what others have wrong, drawn at 1 px and 0.05 degrees."""
     rng, off, stated = np.random.default_rng(5), [], []
@@ -125,7 +125,9 @@ def sky_error(night, solution):
 OPTIONS = {}, {"static": "fit"}, {"layout_sigma": {"shift": 2.0, "rotation": 0.2}}
 
 
-@pytest.mark.parametrize("options", OPTIONS, ids=str)
+@pytest.mark.parametrize(
+    "options", [OPTIONS[0], *(pytest.param(each, marks=pytest.mark.slow) for each in OPTIONS[1:])], ids=str
+)
 def test_it_has_no_vote_on_the_sky_whatever_is_fitted(night, matches, options):
     """A quarter of 45 px otherwise; the headers of seven exposures are 3 px off, each."""
     with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
@@ -193,7 +195,7 @@ def test_a_layout_that_is_held_and_wrong_is_the_cause(matches):
     assert {check.cure for check in wrong} == {"see camera first, which is the cause"}
 
 
-@pytest.mark.parametrize("seed", [40, 61])
+@pytest.mark.parametrize("seed", [40, pytest.param(61, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("odd", [(22.0, -24.0, 0.0), (0.0, 0.0, 0.0)])
 def test_a_star_or_two_show_it(seed, odd):
     """If all that cross are far off; and what is held, or stated, is then not named as a cure of the few ties."""

@@ -223,7 +223,14 @@ def test_wrong_usage_is_told_in_a_line_with_the_nearest_option(capsys, words, me
     assert re.match(message, line)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)])
+@pytest.mark.parametrize(
+    "number",
+    [
+        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
+        signal.SIGTERM,
+        pytest.param(getattr(signal, "SIGHUP", signal.SIGTERM), marks=pytest.mark.slow),
+    ],
+)
 def test_a_stopped_run_leaves_nothing(night, tmp_path, capsys, monkeypatch, number):
     """By Ctrl-C, or by a batch system."""
     (tmp_path / "scratch").mkdir()
@@ -261,6 +268,7 @@ def test_timings_are_what_one_waits_for(whole):
     assert f"start {timings['start']:.2f} s, read" in (whole.out / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_two_workers_leave_the_same(whole, night, tmp_path):
     """In a process of its own, where workers are copies, one of which draws the report while files are written."""
     frames, out = [*night, whole.out.parent / "empty.fits"], tmp_path / "out"
@@ -323,6 +331,7 @@ def test_one_exposure_only(night, tmp_path, capsys):
     failed(capsys, run(night[:1], tmp_path / "out"), "only one exposure", night[0].stem)
 
 
+@pytest.mark.slow
 def test_fewer_stars_than_modes(night, tmp_path, capsys):
     failed(
         capsys, run(night, tmp_path / "out", "--degree", "12"), "stars, fewer than the 91 modes of degree 12", "lower"
@@ -444,6 +453,7 @@ def test_ctrl_c_while_modules_are_imported_is_one_line(name):
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "legdistort: interrupted\n")
 
 
+@pytest.mark.slow
 def test_commands_work_without_any_stream(night, tmp_path):
     """As a daemon has it, and with ``2>&-``: nothing of theirs is written into files, which would take the numbers."""
     out = tmp_path / "d.ecsv"
@@ -454,7 +464,14 @@ def test_commands_work_without_any_stream(night, tmp_path):
     assert len(read_table(out)) > 20
 
 
-@pytest.mark.parametrize("closed", [["stderr"], ["stdout"], ["stdout", "stderr"]])
+@pytest.mark.parametrize(
+    "closed",
+    [
+        pytest.param(["stderr"], marks=pytest.mark.slow),
+        pytest.param(["stdout"], marks=pytest.mark.slow),
+        ["stdout", "stderr"],
+    ],
+)
 def test_main_works_in_programs_without_streams(night, tmp_path, monkeypatch, closed):
     for name in closed:
         monkeypatch.setattr(sys, name, None)
@@ -465,6 +482,7 @@ def test_main_works_in_programs_without_streams(night, tmp_path, monkeypatch, cl
     assert list(map_items(abs, [-1], progress=True)) == [1]
 
 
+@pytest.mark.slow
 def test_a_full_standard_error_is_no_reason_to_fail(night, tmp_path):
     with open("/dev/full", "w") as full:
         command = [sys.executable, "-m", "legdistort", "show", "nowhere"]
@@ -792,7 +810,10 @@ def test_steps_keep_the_sky_as_run_finds_it(whole, steps, tmp_path, capsys, monk
     assert "matched without the headers of its frames, so without their sky: " in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("kind", "files"), [("keck-lists", "*.lis"), ("hst-lists", "*.xymq"), ("gwcs", "*.asdf")])
+@pytest.mark.parametrize(
+    ("kind", "files"),
+    [("keck-lists", "*.lis"), ("hst-lists", "*.xymq"), pytest.param("gwcs", "*.asdf", marks=pytest.mark.slow)],
+)
 def test_example_files_are_read_and_stay_the_same(kind, files, tmp_path, capsys):
     assert main(["demo", "--as", kind, "--out", str(tmp_path / "a")]) == 0
     written = sorted(map(Path, capsys.readouterr().out.split()))
@@ -870,7 +891,8 @@ def test_widths_go_with_the_prior_of_headers(night, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("terminal", "more", "shown"), [(True, [], True), (True, ["--quiet"], False), (False, [], False)]
+    ("terminal", "more", "shown"),
+    [(True, [], True), pytest.param(True, ["--quiet"], False, marks=pytest.mark.slow), (False, [], False)],
 )
 @pytest.mark.usefixtures("undrawn")
 def test_writing_shows_a_bar_on_a_terminal(terminal, more, shown, demo, tmp_path, capsys, monkeypatch):
@@ -960,6 +982,7 @@ def test_show_names_the_detector_of_what_it_prints(tmp_path, capsys):
     assert capsys.readouterr().out.startswith("quantity")
 
 
+@pytest.mark.slow
 def test_what_is_said_of_every_image_is_said_of_all(night, demo, tmp_path, capsys, monkeypatch):
     """Of more than a few images a line or two, unless each is asked for."""
     monkeypatch.setattr("legdistort.cli.arguments._MOST_LINES", 2)

@@ -33,6 +33,7 @@ def test_exposures_may_be_left_out_by_name(table, tmp_path, capsys):
     assert "--without night* is none of the exposures: exp00, exp01" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_odd_night_is_a_failure_which_its_name_cures(tmp_path, capsys):
     table = Nights(5, per=2, odd=0.5, roll=0.7, n_stars=120).table
     del table["block"]

@@ -33,7 +33,7 @@ def test_it_is_the_exact_algorithm():
 
 
 @pytest.mark.parametrize("roll", [0, 2, 45, 137])
-@pytest.mark.parametrize("side", [256, 64])
+@pytest.mark.parametrize("side", [pytest.param(256, marks=pytest.mark.slow), 64])
 def test_bent_blocks_fit_together(monkeypatch, roll, side):
     solution, *_ = scene(1, rolls=(roll,), seed=3)
     y, x = np.indices(SHAPE)

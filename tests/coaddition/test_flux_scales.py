@@ -354,6 +354,7 @@ class TestBackground:
 
 
 class TestFlux:
+    @pytest.mark.slow
     def test_flux_across_a_field_with_20_px_of_distortion(self):
         """Ours within 0.3 %, beside reproject's own function on the same gwcs, which conserves surface brightness."""
         solution, stars, flux, exposures, together = plain()
@@ -399,7 +400,7 @@ def _turned(solution, scale, angle=0.3):
     return grid
 
 
-@pytest.mark.parametrize("scale", [None, 0.5, 2])
+@pytest.mark.parametrize("scale", [None, *(pytest.param(each, marks=pytest.mark.slow) for each in (0.5, 2))])
 @pytest.mark.parametrize("settings", [{"order": 1}, {"order": 3}, {"algorithm": "drizzle"}, {"algorithm": "adaptive"}])
 def test_noise_of_sums(settings, scale):
     """NOISECOR is the noise of the sum over a box over what VAR says, whatever the size of the pixels."""

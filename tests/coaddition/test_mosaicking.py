@@ -245,7 +245,7 @@ class TestSky:
 
 
 class TestCombination:
-    @pytest.mark.parametrize("method", ["median", "clipped"])
+    @pytest.mark.parametrize("method", [pytest.param("median", marks=pytest.mark.slow), "clipped"])
     def test_hot_pixel_and_trail_are_rejected(self, method):
         solution, stars, flux = scene(4, rolls=(0, 1, -1, 2), spread=5)
         rng = np.random.default_rng(5)
@@ -292,6 +292,7 @@ class TestCombination:
         steps = coadd(raised, solution, match_background=False)
         assert np.abs(steps.data[ok] - mosaic.data[ok]).max() > 10
 
+    @pytest.mark.slow
     def test_variance_is_that_of_the_pixels(self):
         solution, *_ = scene(4, rolls=(0, 1, -1, 2))
         rng = np.random.default_rng(8)
@@ -405,7 +406,15 @@ class TestFile:
         assert np.median(mosaic.variance[mosaic.footprint == 4]) == pytest.approx(0.7, abs=0.3)
         np.testing.assert_allclose(back.uncertainty**2, mosaic.variance, rtol=1e-5)
 
-    @pytest.mark.parametrize("planes", [(), ("UNCERT", "MASK"), ["CONTEXT"], "WEIGHT"])
+    @pytest.mark.parametrize(
+        "planes",
+        [
+            (),
+            ("UNCERT", "MASK"),
+            pytest.param(["CONTEXT"], marks=pytest.mark.slow),
+            pytest.param("WEIGHT", marks=pytest.mark.slow),
+        ],
+    )
     def test_planes_that_are_asked_for(self, planes, tmp_path):
         solution, _, _, exposures, _ = plain()
         mosaic = coadd(exposures, solution, planes=planes)

@@ -184,8 +184,8 @@ def gwcs_of_asdf(*keys):
 @pytest.mark.parametrize(
     ("ending", "read"),
     [
-        ("cal.fits", gwcs_of_fits),
-        ("model.asdf", gwcs_of_asdf("meta", "wcs")),
+        pytest.param("cal.fits", gwcs_of_fits, marks=pytest.mark.slow),
+        pytest.param("model.asdf", gwcs_of_asdf("meta", "wcs"), marks=pytest.mark.slow),
         ("wcs.asdf", gwcs_of_asdf("wcs")),
     ],
     ids=["frames", "models", "bare gwcs"],
@@ -208,6 +208,7 @@ def test_a_visit_by_its_catalogues(ending, read, visit, tmp_path, monkeypatch):
     assert after == pytest.approx(0.01, rel=0.15)
 
 
+@pytest.mark.slow
 def test_catalogues_beside_bare_gwcs(visit, tmp_path, monkeypatch):
     """Files of a gwcs and nothing else: sky and shape of lists, and places to put the refined gwcs into."""
     monkeypatch.chdir(tmp_path)

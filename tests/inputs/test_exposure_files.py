@@ -165,6 +165,7 @@ def test_measure_and_match_leave_bad_files_out(tmp_path, night, capsys):
     assert json.loads(capsys.readouterr().out)["left_out"].keys() >= reasons.keys()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_run_leaves_bad_files_out(tmp_path, night):
     bad, reasons = bad_files(tmp_path)

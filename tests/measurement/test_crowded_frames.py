@@ -85,6 +85,7 @@ def test_unit_and_orientation_do_not_matter(field, table):
     assert np.mean(np.abs(off) < 0.3 * table["flux_err"][same]) > 0.97
 
 
+@pytest.mark.slow
 def test_true_psf_serves_as_well(field, table):
     given = ld.measure(exposure(field.data), psf=true_psf())
     assert set(given["psf"]) == {"true"}

@@ -41,7 +41,7 @@ def psf(request):
     return as_psf(PupilPSF(resolution=3.5, **request.param), (512, 512))
 
 
-@pytest.mark.parametrize("crowded", [False, True])
+@pytest.mark.parametrize("crowded", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_halos_and_rings_are_no_stars(psf, crowded):
     rng, shape = np.random.default_rng(3), (512, 512)
     xy = rng.uniform(5, 506, (214, 2)) if crowded else scattered(rng, 49, 512)  # one star a (10 FWHM)^2
@@ -60,7 +60,7 @@ def ringed(dx, dy, fwhm):
     return np.exp(-2.77 * r**2) + 0.08 * (1 + np.cos(angle)) * np.exp(-0.5 * ((r - 1.7) / 0.25) ** 2)
 
 
-@pytest.mark.parametrize("companions", [0, 10])
+@pytest.mark.parametrize("companions", [pytest.param(0, marks=pytest.mark.slow), 10])
 def test_side_lobes_of_bright_stars_are_no_stars(companions):
     """The companions put beside some of the stars, twice as bright as the ring, are found."""
     rng, fwhm, size = np.random.default_rng(5), 3.5, 480
@@ -115,7 +115,7 @@ def test_variance_is_that_of_the_sky_in_a_crowded_field_with_halos():
     assert np.median(unknown.variance / expected) == pytest.approx(1, abs=0.25)
 
 
-@pytest.mark.parametrize("fwhm", [1.4, 8.0, 14.0])
+@pytest.mark.parametrize("fwhm", [1.4, pytest.param(8.0, marks=pytest.mark.slow), 14.0])
 def test_narrow_and_wide_stars_are_found_once(fwhm):
     rng = np.random.default_rng(8)
     size = 700 if fwhm > 5 else 300
@@ -127,7 +127,9 @@ def test_narrow_and_wide_stars_are_found_once(fwhm):
     assert len(false) <= 1
 
 
-@pytest.mark.parametrize("saturated", [False, True])
+@pytest.mark.parametrize(
+    "saturated", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.slow)]
+)
 def test_one_width_and_one_position_in_all_cut_outs_of_a_crowded_field(saturated):
     """The same pixels in four frames, undersampled; the brightest stars have flat tops, and no header says so."""
     rng, fwhm, size, part = np.random.default_rng(9), 1.4, 360, 250

@@ -232,6 +232,7 @@ def judged(frame, **options):
     return table, rows, false, [left / np.sqrt(np.einsum("naa->na", c)) for c in (best, own)]
 
 
+@pytest.mark.slow
 def test_a_core_that_moffat_profiles_lack(monkeypatch):
     """A faint core in a narrow halo: bright stars count with their peaks, and faint ones do not take up the sky."""
     monkeypatch.setitem(ao_images.SHAPES, "symmetric", {"halo_fwhm": 10.0})
@@ -300,6 +301,7 @@ def test_what_all_bright_stars_leave_is_no_noise_of_theirs():
     assert measured(frame.data + companion.astype(np.float32))[1][k].min() > 1.3 * stated[k].max()
 
 
+@pytest.mark.slow
 def test_neighbours_are_fitted_together():
     """Two stars 4 px apart: positions scatter as their errors say, and the pair is not one star."""
     rng = np.random.default_rng(4)
@@ -438,6 +440,7 @@ def test_auto_leaves_moffat_profiles_as_they_are():
         assert np.array_equal(auto[name], moffat[name]), name
 
 
+@pytest.mark.slow
 def test_one_definition_of_the_centre_for_all_exposures():
     """Two exposures behind adaptive optics outvote one that is not; it has an effective PSF too."""
     frames = [night()[0], moffat_exposure(), replace(night()[0], name="another")]
@@ -491,6 +494,7 @@ def write_psfex(path, ends, **changes):
     table.writeto(path, overwrite=True)
 
 
+@pytest.mark.slow
 def test_psfs_from_elsewhere_measure_as_well(tmp_path, made):
     exposure, xy, covariance, _ = night()
     tables = {}
@@ -617,6 +621,7 @@ def test_options_that_belong_to_moffat_profiles():
 # --- errors by injected stars ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_noise_curve_is_that_of_the_true_psf(made):
     """Stars put in as the effective PSF of the frame, and its halo: errors are at the bound of the pupil's."""
     exposure, xy, _, _ = night()
@@ -635,6 +640,7 @@ def test_noise_curve_is_that_of_the_true_psf(made):
     assert np.mean(ratio) == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.slow
 def test_errors_of_injected_stars_are_true_on_these_images(made, monkeypatch):
     monkeypatch.setattr(injection, "N_FLUXES", 6)
     _, xy, covariance, _ = night()

@@ -46,6 +46,7 @@ def test_stars_whose_tops_are_saturated_have_the_same_structure(frame):
     assert np.count_nonzero(cKDTree(frame.xy).query(xy)[0] > frame.fwhm) <= 3
 
 
+@pytest.mark.slow
 def test_companions_are_found_where_others_have_spots(telescope, frame):
     """A twentieth as bright as a star, at places that differ from star to star."""
     rng, bright = np.random.default_rng(6), np.argsort(-frame.flux)[2:10]

@@ -100,7 +100,7 @@ def mosaic():
     )
 
 
-@pytest.mark.parametrize("stem", ["s", "A#1?x;y%41"])
+@pytest.mark.parametrize("stem", [pytest.param("s", marks=pytest.mark.slow), "A#1?x;y%41"])
 def test_solutions_priors_and_wcs(solution, place, alone, stem):
     solution.write(place / f"{stem}.asdf")
     again = Solution.read(place / f"{stem}.asdf")
@@ -118,7 +118,7 @@ def test_solutions_priors_and_wcs(solution, place, alone, stem):
     alone(f"{stem}.asdf", f"{stem}.prior.asdf", f"{stem}.wcs.asdf")
 
 
-@pytest.mark.parametrize("stem", ["m", "A#1?x;y%41"])
+@pytest.mark.parametrize("stem", [pytest.param("m", marks=pytest.mark.slow), "A#1?x;y%41"])
 def test_mosaics(place, alone, stem):
     endings = (".fits", ".fits.gz", ".fits.bz2", ".asdf")
     for ending in endings:
@@ -132,7 +132,7 @@ def test_mosaics(place, alone, stem):
     alone(*(stem + ending for ending in endings))
 
 
-@pytest.mark.parametrize("stem", ["t", "A#1?x;y%41"])
+@pytest.mark.parametrize("stem", [pytest.param("t", marks=pytest.mark.slow), "A#1?x;y%41"])
 def test_tables(solution, place, alone, stem):
     endings = (".ecsv", ".fits", ".vot", ".xml", ".csv")
     for ending in endings:

@@ -116,7 +116,8 @@ sys.exit(f"{package} can be written")
 """
 
 
-@pytest.mark.parametrize("compiled_from", [10**9, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("compiled_from", [10**9, 1])
 def test_a_package_that_cannot_be_written(table, tmp_path, read_only, compiled_from):
     """Nor is there a home: compiled loops are made without a place to keep them."""
     bare = {
@@ -236,6 +237,7 @@ def test_files_of_the_user_in_a_folder_of_results(table, tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["matched.ecsv", "out"]
 
 
+@pytest.mark.slow
 def test_two_commands_at_once(table, tmp_path):
     """One works; the other is told, or finds the results of the first. Neither has a part of the other's."""
     out, environment = tmp_path / "out", os.environ | {"PYTHONPATH": str(ROOT)}

@@ -106,6 +106,7 @@ def test_stars_of_the_solution_keep_their_numbers(solution, found):
     assert list(found.stars["mag"]) == list(25 - 2.5 * np.log10(found.stars["flux"]))
 
 
+@pytest.mark.slow
 def test_a_star_without_a_position_in_the_solution_is_a_new_one(truth, solution, found):
     """All its observations were left out, say."""
     positions = solution.estimate.positions.copy()
@@ -283,6 +284,7 @@ def test_files_and_command(truth, solution, tmp_path, capsys):
     assert "give the catalogue another" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_pixels_on_the_disk_give_the_same_catalogue(truth, solution, found, tmp_path, monkeypatch):
     """Bit for bit; nothing is left behind."""
     monkeypatch.setattr(ld.photometry.catalogue, "_IN_MEMORY", 0)
@@ -296,7 +298,14 @@ def test_pixels_on_the_disk_give_the_same_catalogue(truth, solution, found, tmp_
         ld.catalogue(exposures_of(truth), solution, scratch=tmp_path / "none")
 
 
-@pytest.mark.parametrize("sides", [{"_BLOCK": 61, "_SMALL": 37}, {"_WORTH": 0}, {"_AROUND": 6.0}])
+@pytest.mark.parametrize(
+    "sides",
+    [
+        {"_BLOCK": 61, "_SMALL": 37},
+        pytest.param({"_WORTH": 0}, marks=pytest.mark.slow),
+        pytest.param({"_AROUND": 6.0}, marks=pytest.mark.slow),
+    ],
+)
 def test_a_catalogue_does_not_depend_on_the_blocks_that_are_searched(truth, solution, found, monkeypatch, sides):
     """Smaller ones, always all of them, more around what has changed: to a thousandth of an error."""
     for name, value in sides.items():
@@ -307,6 +316,7 @@ def test_a_catalogue_does_not_depend_on_the_blocks_that_are_searched(truth, solu
         np.testing.assert_array_less(np.abs(other.stars[name] - found.stars[name]), 1e-3 * found.stars[f"{name}_err"])
 
 
+@pytest.mark.slow
 def test_fluxes_at_given_places(truth, solution, found):
     """Of stars too faint to be found and of empty sky as their errors state; of bright ones as they are."""
     rng, pixels = np.random.default_rng(5), truth.pixels[0]
@@ -361,6 +371,7 @@ def test_places_that_cannot_be_measured_are_named(truth, solution, tmp_path):
     assert out.stars["n"][0] == 3
 
 
+@pytest.mark.slow
 def test_artificial_stars_are_found_as_stars_are(truth, solution, found, monkeypatch):
     """Faint ones are missed, bright ones not, errors are those stated; the catalogue and its pixels stay."""
     measure, left = ld.photometry.catalogue.measure_completeness, []
@@ -445,6 +456,7 @@ def test_a_sky_made_anew_takes_no_more_of_a_star_that_is_not_seen():
     assert taken[False][-1] > 2 * taken[False][0]
 
 
+@pytest.mark.slow
 def test_artificial_stars_of_the_command(truth, solution, tmp_path, capsys):
     """Tables of two calls with one seed are the same; what stands there is not replaced."""
     paths = written(truth.frames[:3], solution, tmp_path)
@@ -463,6 +475,7 @@ def test_artificial_stars_of_the_command(truth, solution, tmp_path, capsys):
     assert "--seed is for the stars of --artificial" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_run_ends_with_the_catalogue(truth, tmp_path, monkeypatch):
     """That of the solution which it leaves; without one where there can be none, by a warning."""
     paths = []

@@ -150,7 +150,9 @@ def test_it_is_no_static_map_to_correct_with(sim, declared):
 
 
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.LegdistortWarning")  # these fit this set badly
-@pytest.mark.parametrize("options", [{"static": "fit"}, {"degree": "auto"}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{"static": "fit"}, pytest.param({"degree": "auto"}, marks=pytest.mark.slow)], ids=str
+)
 def test_with_other_options(sim, options):
     solution = ld.solve(sim.matches, prior=ld.Prior(None, static_sigma=2.0), **options)
     assert solution.gauge.unknown == ()

@@ -167,6 +167,7 @@ def test_headers_without_a_distortion():
     assert isinstance(prior, ld.Prior)
 
 
+@pytest.mark.slow
 def test_the_gwcs_beside_an_image_goes_before_its_header(tmp_path):
     table, _ = positions()
     exposures = [exposure(k) for k in range(6)]
@@ -231,7 +232,9 @@ def unused():
     return ld.match(table, exposures=[exposure(k) for k in range(6)], tolerance=8)
 
 
-@pytest.mark.parametrize("road", ["validate", "dropped", "file"])
+@pytest.mark.parametrize(
+    "road", [pytest.param("validate", marks=pytest.mark.slow), pytest.param("dropped", marks=pytest.mark.slow), "file"]
+)
 def test_a_distortion_that_is_not_used_is_said_on_every_road(road, unused, tmp_path):
     matches, options = unused if road == "dropped" else unused.without({"e5": "by hand"}), {}
     if road == "validate":
@@ -249,6 +252,7 @@ def test_a_distortion_that_is_not_used_is_said_on_every_road(road, unused, tmp_p
     assert state_of(solution) == "warn"
 
 
+@pytest.mark.slow
 def test_commands_one_after_the_other_say_it(tmp_path, sip_night, capsys):
     found, matched, out = (str(tmp_path / name) for name in ("found.ecsv", "matched.ecsv", "out"))
     assert main(["measure", *map(str, sip_night[:4]), "--out", found, "--psf", "moffat", "--quiet"]) == 0
@@ -272,6 +276,7 @@ def test_the_sky_is_that_of_the_headers():
     assert np.abs(off).max() < 0.02
 
 
+@pytest.mark.slow
 def test_run_takes_the_prior_of_the_headers(tmp_path, night, sip_night, monkeypatch):
     frames, given = sip_night, {}
     monkeypatch.setattr(pipeline, "solve", lambda matches, **options: given.update(options) or pytest.skip("solved"))

@@ -192,6 +192,7 @@ def test_what_no_maps_can_hold(tmp_path, given, message):
 # -- what no series follows
 
 
+@pytest.mark.slow
 def test_a_rough_map_is_not_truncated(mask, rough_prior, tmp_path):
     q = mask.at(4000)
     truth = mask.map(q)

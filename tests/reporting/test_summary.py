@@ -102,6 +102,7 @@ def test_every_detector_is_in_figures():
     assert all(each["x_err_px"] > 0 for each in found["detectors"])
 
 
+@pytest.mark.slow
 def test_a_map_that_folds_costs_its_image_alone(tmp_path):
     """Named in summary and check; the others have their WCS, and are co-added."""
     night = simulate_exposures(small=True, n_exposures=4, seed=1)

@@ -95,6 +95,7 @@ def few_undithered(n_stars, seed, **setting):
     return solution, sky[solution.estimate.star_names]
 
 
+@pytest.mark.slow
 def test_relative_errors_of_few_stars_are_those_after_what_nothing_determines():
     squares = np.zeros(2)
     for seed in range(8):

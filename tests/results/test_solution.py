@@ -229,7 +229,7 @@ def assert_survives(solution, remake):
 
 
 @pytest.mark.parametrize("remake", [lambda s: pickle.loads(pickle.dumps(s)), copy.copy, copy.deepcopy])
-@pytest.mark.parametrize("what", ["motions", "model"])
+@pytest.mark.parametrize("what", ["motions", pytest.param("model", marks=pytest.mark.slow)])
 def test_copies(what, remake):
     solution = solve(moving_stars.field(60).matches, motion="proper") if what == "motions" else PRODUCERS["model"]()
     assert_survives(solution, remake)

@@ -695,7 +695,7 @@ NONSENSE = st.one_of(
     st.integers(0, 5).map(lambda n: np.full((2, n), np.nan)),
 )  # fmt: skip
 FUZZ = settings(
-    max_examples=25, deadline=None, derandomize=True, database=None, phases=[Phase.generate],
+    max_examples=10, deadline=None, derandomize=True, database=None, phases=[Phase.generate],
     suppress_health_check=list(HealthCheck),
 )  # fmt: skip
 

@@ -540,6 +540,7 @@ class TestMosaicInBlocks:
         # found in a table of 256 fractions of a pixel, so rounding may take its neighbour
         np.testing.assert_allclose(pieces.variance, whole.variance, rtol=0.02)
 
+    @pytest.mark.slow
     @COMPILED
     def test_any_number_of_workers_gives_the_same_bits(self, client, monkeypatch, tmp_path, compiled_from):
         solution, exposures = night(uncertainty=np.full(SHAPE, 8.0))
@@ -551,7 +552,7 @@ class TestMosaicInBlocks:
             assert_same(ld.coadd(exposures, solution, workers=workers, **settings), one)
         assert not any(tmp_path.iterdir())
 
-    @pytest.mark.parametrize("method", ["mean", "clipped"])
+    @pytest.mark.parametrize("method", [pytest.param("mean", marks=pytest.mark.slow), "clipped"])
     def test_drizzle_in_processes_gives_the_same_bits(self, monkeypatch, method):
         pytest.importorskip("drizzle")
         solution, exposures = night(uncertainty=np.full(SHAPE, 8.0))
@@ -590,6 +591,7 @@ class TestMosaicInBlocks:
         for plane in (mosaic.weight, mosaic.flags, *mosaic.context):
             assert not plane[empty].any()
 
+    @pytest.mark.slow
     def test_the_context_says_who_contributes(self):
         solution, exposures = night(34)
         mosaic = ld.coadd(exposures, solution, order=1)

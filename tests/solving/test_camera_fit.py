@@ -21,7 +21,7 @@ def span(columns, k):
     return directions[:, :k]
 
 
-@pytest.mark.parametrize(("turn", "unknown"), [(0.0, 4), (0.8, 0)])
+@pytest.mark.parametrize(("turn", "unknown"), [pytest.param(0.0, 4, marks=pytest.mark.slow), (0.8, 0)])
 def test_what_is_unknown(turn, unknown):
     """The null space of the dense matrix: a map of the sky, one of the focal plane, and what `gauge.unknown` lists."""
     field, degree = gsaoi_calibration.night(turn), gsaoi_calibration.DEGREE

@@ -69,7 +69,7 @@ def test_the_dense_oracle_agrees(kind, epochs):
 @pytest.mark.parametrize(
     ("n", "kind", "sigma", "accuracy"),
     [
-        (6, "proper", None, 0.2),
+        pytest.param(6, "proper", None, 0.2, marks=pytest.mark.slow),
         (3, "parallax", None, 0.25),
         pytest.param(30, "proper", None, 0.1, marks=pytest.mark.slow),
         pytest.param(30, "proper", 0.3, 0.1, marks=pytest.mark.slow),

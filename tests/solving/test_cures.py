@@ -104,6 +104,7 @@ def test_errors_that_are_wrong_are_not_taken_for_patterns():
     assert {check.cure for check in wrong} == {"--errors floor would bring chi2/dof to 1.00"}
 
 
+@pytest.mark.slow
 def test_turbulence_that_no_degree_ends_is_counted_in_the_errors():
     data = known_displacements.displaced("turbulence", 0, size=5.0, n_stars=70)[0]
     degree = checks_of(solved(data))["degree"]

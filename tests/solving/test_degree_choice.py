@@ -255,7 +255,9 @@ def strip(n_exposures, n_seen, share, seed):
 
 
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.LegdistortWarning")
-@pytest.mark.parametrize(("n_exposures", "n_seen", "share"), [(8, 45, 0.4), (10, 45, 0.35)])
+@pytest.mark.parametrize(
+    ("n_exposures", "n_seen", "share"), [(8, 45, 0.4), pytest.param(10, 45, 0.35, marks=pytest.mark.slow)]
+)
 def test_stars_left_out_of_exposures_that_hang_together_weakly(n_exposures, n_seen, share, monkeypatch):
     """Steps along directions that hardly anything determines count, which no few conjugate gradients find."""
     matches = strip(n_exposures, n_seen, share, 1)
@@ -299,6 +301,7 @@ def test_widths_allow_more():
     assert chosen.degree >= 2
 
 
+@pytest.mark.slow
 def test_a_mismatched_star_has_no_say():
     sim = simulate(40, 0.5, 0.5, 0.5, n_exposures=6)
     table = sim.matches.table.copy()
@@ -376,6 +379,7 @@ def test_noise_is_no_energy():
     assert max(np.abs(excess)) < degree_choice.ALARM
 
 
+@pytest.mark.slow
 def test_a_convention_is_no_energy():
     """Without a prior all exposures depart alike, by what the convention makes of their common map; degree 3 is all."""
     excess = []
@@ -389,7 +393,7 @@ def test_a_convention_is_no_energy():
     assert max(np.abs(excess)) < 3
 
 
-@pytest.mark.parametrize("quartic", [0.0, 0.03])
+@pytest.mark.parametrize("quartic", [pytest.param(0.0, marks=pytest.mark.slow), 0.03])
 def test_a_common_map_that_nobody_knew_is_no_energy_where_stars_are_many(quartic):
     """It carries the distortion of every exposure to other places by 1.5 px, which makes modes of higher degrees.
 
@@ -405,7 +409,7 @@ def test_a_common_map_that_nobody_knew_is_no_energy_where_stars_are_many(quartic
     assert np.all(np.abs(fifth) < degree_choice.ALARM)
 
 
-@pytest.mark.parametrize("n_exposures", [2, 3])
+@pytest.mark.parametrize("n_exposures", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_energy_beyond_what_an_unknown_map_can_do_is_seen_in_few_exposures(n_exposures):
     """A map that would explain 0.1 px in the end would have to be a hundred pixels large."""
     static, width = np.repeat([1.5, 0], [10, 5]), np.repeat([0.9, 0.1], [10, 5])
@@ -416,7 +420,7 @@ def test_energy_beyond_what_an_unknown_map_can_do_is_seen_in_few_exposures(n_exp
             assert folding(sim, 3, 4, top=n_exposures + 2).excess > 1.8 * degree_choice.ALARM
 
 
-@pytest.mark.parametrize("direct", [True, False])
+@pytest.mark.parametrize("direct", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_energy_of_its_own_is_seen_beside_a_common_map(monkeypatch, direct):
     """Quartic modes of every exposure count, however errors differ, whether the equations are factorised or not."""
     monkeypatch.setattr("legdistort.solving.equations.reduced_system.uses_direct", lambda problem: direct)
@@ -450,6 +454,7 @@ def test_where_similarities_are_in_the_poses_no_energy_is_missed():
     assert max(np.abs(excess)) < degree_choice.ALARM
 
 
+@pytest.mark.slow
 def test_alarm_is_raised():
     """Sixteen stars, precise, with more distortion than they can be fitted with at degree 3."""
     sim = simulate(16, 0.5, 0.5, 0.5, 0.3, 0.3, sigma=0.01, seed=2)

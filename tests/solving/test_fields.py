@@ -311,6 +311,7 @@ def test_refused_where_nothing_is_shared():
     assert matches.keep(cut).fields.max() == 0
 
 
+@pytest.mark.slow
 def test_on_the_command_line(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     data, truth = field_sets.drawn_fields(10)

@@ -98,8 +98,8 @@ def test_what_nothing_determines_stays_as_headers_have_it(bent):
 @pytest.mark.parametrize(
     ("degree", "stated"),
     [
-        (2, {"pose_sigma": {"shift": 3.0, "rotation": 0.003}}),
-        (2, {"pose_sigma": {"shift": 3.0, "rotation": 0.05}}),
+        pytest.param(2, {"pose_sigma": {"shift": 3.0, "rotation": 0.003}}, marks=pytest.mark.slow),
+        pytest.param(2, {"pose_sigma": {"shift": 3.0, "rotation": 0.05}}, marks=pytest.mark.slow),
         (3, {"layout_sigma": {"shift": 1.0, "rotation": 0.02}}),
     ],
 )
@@ -120,7 +120,7 @@ def test_detectors_together_keep_the_scale_of_headers(bent):
     assert solution.chi2 == pytest.approx(solution.dof, rel=0.1)
 
 
-@pytest.mark.parametrize("name", ["pose_sigma", "layout_sigma"])
+@pytest.mark.parametrize("name", [pytest.param("pose_sigma", marks=pytest.mark.slow), "layout_sigma"])
 def test_the_check_of_absolute_positions_names_what_cures_it(near, name):
     """Where headers may tell what stars do not; and with it the check passes."""
     before, after = (
@@ -175,6 +175,7 @@ def test_what_no_star_ties_is_not_determined(apart, groups):
     assert groups.camera["2"].place.errors == (np.inf,) * 3
 
 
+@pytest.mark.slow
 def test_a_layout_that_hides_the_stars_that_cross_is_named():
     """Farther off than these are looked for: that was blamed on the dithers, which are three times the gaps."""
     night = header_layouts.Night(2, off=2.0, turn=0.05, odd=(70.0, 0.0, 0.0))
@@ -200,6 +201,7 @@ def with_drawn_statics(night, seed, sigma=0.3):
     return in_camera(matches, replace(matches.camera, detectors=detectors))
 
 
+@pytest.mark.slow
 def test_a_layout_beside_statics_with_widths_is_determined():
     """Rounding was taken for a direction that is not: errors were infinite, and a wrong header went into the sky."""
     night = header_layouts.Night(2, off=2.0, turn=0.05, n=7, n_stars=250, odd=(22.0, -24.0, 0.6))
@@ -213,6 +215,7 @@ def test_a_layout_beside_statics_with_widths_is_determined():
     assert "after one affine map of all together" in " ".join(str(solution).split())
 
 
+@pytest.mark.slow
 def test_a_layout_beside_departures_by_evidence_is_determined():
     """Second order was taken for a direction that nothing determines: no star had an absolute error by a catalogue."""
     stars = np.random.default_rng(0).uniform(-400, 2 * (four_detectors.SIZE + four_detectors.GAP) + 340, (160, 2))
@@ -247,7 +250,7 @@ def with_false_ties(matches, n):
     return replace(matches, table=table)
 
 
-@pytest.mark.parametrize("n", [1, 2])
+@pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_false_tie_moves_no_detector(apart, n):
     """One or two stars that tie detectors wrongly are left out, and named; the layout stays as headers have it."""
     matches = with_false_ties(legdistort.match(apart.table, exposures=apart.exposures), n)
@@ -361,7 +364,7 @@ def pull_across(n_sets, **options):
 WIDTHS = {"shift": 1.0, "rotation": 0.02, "scale": 1e-6}
 
 
-@pytest.mark.parametrize("n_sets", [4, pytest.param(25, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n_sets", [pytest.param(4, marks=pytest.mark.slow), pytest.param(25, marks=pytest.mark.sets)])
 def test_what_the_caller_knows_of_the_layout(n_sets):
     assert pull_across(n_sets, layout_sigma=WIDTHS) == pytest.approx(1, abs=0.5 if n_sets < 10 else 0.2)
 
@@ -382,7 +385,7 @@ def test_the_caller_s_widths_are_those_of_a_camera(apart):
 @pytest.mark.parametrize(
     ("n_sets", "n_known", "error", "n_wrong"),
     [
-        (4, 80, 0.01, 0),
+        pytest.param(4, 80, 0.01, 0, marks=pytest.mark.slow),
         pytest.param(12, 80, 0.05, 0, marks=pytest.mark.slow),
         pytest.param(12, 40, 0.02, 4, marks=pytest.mark.slow),
     ],

@@ -160,6 +160,7 @@ class TestStatic:
         assert test.power(1e-3) > 0.95
         assert self.of(data, -truth["static"], sigma).p < (1e-10 if not sigma else 1e-3)
 
+    @pytest.mark.slow
     def test_p_is_evenly_spread_for_right_priors(self):
         sets = (dense_model.drawn_set(seed, n_stars=70) for seed in range(30))
         p = [self.of(data, truth["static"]).p for data, truth in sets]
@@ -263,6 +264,7 @@ class TestCheck:
         data, _ = dense_model.drawn_set(12, rolls=30.0)
         assert not [c for c in solved(data, **options).checks if c.name == "prior"]
 
+    @pytest.mark.slow
     def test_many_exposures_are_drawn_from(self):
         data, truth = dense_model.drawn_set(13, rolls=30.0, n=60, n_stars=60)
         assert self.of(data, ld.Prior(truth["static"])).state == "pass"

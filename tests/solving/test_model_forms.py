@@ -108,8 +108,11 @@ def test_a_whole_form_is_the_usual_solution(simulation, plain):
     "domain",
     [
         {"x_domain": (0, 1000), "y_domain": (-100, 3000)},
-        {"x_domain": (0, 2000), "y_domain": (0, 2000), "x_window": (-1, 0), "y_window": (0, 1)},
-        {},
+        pytest.param(
+            {"x_domain": (0, 2000), "y_domain": (0, 2000), "x_window": (-1, 0), "y_window": (0, 1)},
+            marks=pytest.mark.slow,
+        ),
+        pytest.param({}, marks=pytest.mark.slow),
     ],
 )
 def test_any_domain_is_converted_exactly(simulation, plain, domain):

@@ -110,7 +110,7 @@ def test_what_is_one_night_or_says_that_nights_share_nothing_is_solved_alike():
 
 def test_absolute_errors_of_nights(tmp_path):
     """Taken for independent exposures, the squares are 4 times what is stated (8 sets; measured with 20)."""
-    found = [Nights(seed, roll=0.7) for seed in range(6)]
+    found = [Nights(seed, roll=0.7) for seed in range(3)]
     off, stated, _ = squares((each, each.table) for each in found).sum(axis=0)
     assert 0.4 < off / stated < 2
     solution = ld.solve(matches(found[0].table))
@@ -263,12 +263,14 @@ def test_figures_of_a_night_are_those_of_its_observations():
     ("words", "odd"),
     [
         ({"odd": 0.5, "alone": True}, [4]),  # one exposure
-        ({"odd": 0.5, "alone": True, "per": 1, "nights": 10}, [5]),  # as all others
+        pytest.param({"odd": 0.5, "alone": True, "per": 1, "nights": 10}, [5], marks=pytest.mark.slow),  # as all others
         ({"nights": 3, "odd": 0.5}, [1]),
-        ({"nights": 30, "odd": 0.5, "per": 2, "n_stars": 60}, [15]),  # in two groups
+        pytest.param(
+            {"nights": 30, "odd": 0.5, "per": 2, "n_stars": 60}, [15], marks=pytest.mark.slow
+        ),  # in two groups
         ({"nights": 2, "odd": 0.5}, []),  # nothing tells which
         ({"nights": 3}, []),
-        ({"alone": True}, []),
+        pytest.param({"alone": True}, [], marks=pytest.mark.slow),
     ],
 )
 def test_nights_are_odd_among_few_and_unlike_ones(words, odd):
@@ -289,7 +291,7 @@ def test_a_night_is_odd_from_three_times_the_scatter_of_the_others(size, named):
     assert (worst["ratio"] > 3) == worst["odd"] == named
 
 
-@pytest.mark.parametrize(("last", "odd"), [(0.25, []), (1.0, [7])])
+@pytest.mark.parametrize(("last", "odd"), [(0.25, []), pytest.param(1.0, [7], marks=pytest.mark.slow)])
 def test_modes_of_a_degree_need_not_scatter_alike(last, odd):
     """Where one alone does, five times its scatter is no odd night of eight, as it was beside modes that do not."""
     nights = Nights(3, roll=0.7, nightly=0.0, single=0.01, n_stars=120)
@@ -306,7 +308,7 @@ def test_one_night_has_nothing_to_be_compared_with():
     assert np.isnan(row["departure"])
 
 
-@pytest.mark.parametrize("single", [True, False])
+@pytest.mark.parametrize("single", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_all_that_are_odd_are_named(single):
     """Seven of thirty exposures, or three of ten nights: each hides behind the others."""
     rng, nights = np.random.default_rng(3), Nights(3, nights=10, per=3, roll=0.0, nightly=0.01)
@@ -336,7 +338,7 @@ def with_fluxes(nights):
 
 
 @pytest.mark.filterwarnings("ignore:static='fit'. . of 14")  # nights that are hardly turned determine no more
-@pytest.mark.parametrize("errors", ["stated", "by-brightness"])
+@pytest.mark.parametrize("errors", ["stated", pytest.param("by-brightness", marks=pytest.mark.slow)])
 def test_an_odd_night_shows_where_all_have_one_distortion(errors):
     """By what its residuals have in common; errors that are found from these make them as large as they should be."""
     nights = Nights(5, odd=0.2, roll=0.7, n_stars=150)
@@ -411,6 +413,7 @@ def plain_modes(tensor):
     return np.array([[2 * each[i, j] / np.sqrt((2 * i + 1) * (2 * j + 1)) for i, j in orders] for each in tensor])
 
 
+@pytest.mark.slow
 def test_other_nights_are_a_prior_with_their_scatter_as_its_width(tmp_path):
     """Where their static distortion was known exactly it is the width; else it is as much at least."""
     nights = Nights(3, nights=12, per=3, n_stars=120, single=0.003, nightly=0.05, odd=1.0)

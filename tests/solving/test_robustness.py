@@ -197,6 +197,7 @@ def test_many_mismatches_cost_little_and_no_exposure(share):
     assert error(solution, sim) < 1.1 * error(clean, sim)
 
 
+@pytest.mark.slow
 def test_the_choice_of_the_degree_decides_mismatches_once_a_degree(monkeypatch):
     """Not anew in each of the fits that leave some stars out; and they do not sway it."""
     sim = precise(4, n_stars=34, degree=1)
@@ -217,7 +218,9 @@ def test_the_choice_of_the_degree_decides_mismatches_once_a_degree(monkeypatch):
 
 
 @pytest.mark.parametrize("noise", [1.0, 1.5])
-@pytest.mark.parametrize("n_exposures", [2, 3, 4, 11])
+@pytest.mark.parametrize(
+    "n_exposures", [2, pytest.param(3, marks=pytest.mark.slow), 4, pytest.param(11, marks=pytest.mark.slow)]
+)
 def test_clean_data_are_solved_as_without_clipping(n_exposures, noise):
     sim = precise(n_exposures, noise=noise, seed=1)
     solution, plain = solve(sim.matches), solve(sim.matches, clip=None)

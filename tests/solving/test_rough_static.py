@@ -133,6 +133,7 @@ def test_functions_are_independent_of_the_series_and_of_unit_size():
     assert_allclose(functions.fields(q, numbers.T), values @ numbers.T, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_several_detectors_have_names(mask):
     table = mask.matches.table.copy()
     second = np.isin(table["exposure"], ["m1", "m3", "m5"])
@@ -156,6 +157,7 @@ def test_where_it_cannot_be(mask):
             ld.solve(matches, degree=2, terms="rough_static")
 
 
+@pytest.mark.slow
 def test_poses_follow_the_errors_of_the_term(mask, monkeypatch):
     """Poses depart from given ones by the errors of the splines, which is no contradiction."""
     calls, asked = [], known_poses.contradiction

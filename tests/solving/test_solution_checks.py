@@ -170,6 +170,7 @@ def test_freedom_of_observations_sums_to_that_of_chi2():
     assert found.freedom.sum() == pytest.approx(solution.dof - found.released.shape[2])
 
 
+@pytest.mark.slow
 def test_chi2_of_few_observations_is_about_one_where_the_gauge_has_a_second_order():
     found, values = [], []
     for seed in range(20):
@@ -556,6 +557,7 @@ class TestDuplicates:
         assert abs(np.mean(others[others < 0.5])) < 0.02
         assert np.abs(others[others < 0.5]).max() < 0.3
 
+    @pytest.mark.slow
     def test_what_exposures_share_beside_their_noise_makes_no_copies_of_them(self):
         check = self.of(self.refracted(6))
         assert check.state == "warn"

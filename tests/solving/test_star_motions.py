@@ -369,7 +369,11 @@ def test_fast_stars_among_mismatches():
 
 
 @pytest.mark.parametrize(
-    ("settings", "tied"), [({"motion": "proper", "motion_sigma": "evidence"}, True), ({"motion": "parallax"}, False)]
+    ("settings", "tied"),
+    [
+        ({"motion": "proper", "motion_sigma": "evidence"}, True),
+        pytest.param({"motion": "parallax"}, False, marks=pytest.mark.slow),
+    ],
 )
 def test_files_keep_motions(tmp_path, settings, tied):
     sim = field(60, FIVE, parallax=0.1)
@@ -449,7 +453,11 @@ def test_a_catalogue_ties_positions_at_the_epoch_of_the_motions():
 
 @pytest.mark.parametrize(
     ("n", "accuracy", "sigma"),
-    [(4, 0.2, None), (2, 0.3, 0.3), pytest.param(60, 0.1, None, marks=pytest.mark.slow)],
+    [
+        pytest.param(4, 0.2, None, marks=pytest.mark.slow),
+        (2, 0.3, 0.3),
+        pytest.param(60, 0.1, None, marks=pytest.mark.slow),
+    ],
 )
 def test_absolute_motions_tied_to_a_catalogue_are_calibrated(n, accuracy, sigma):
     """30 stars of a catalogue with proper motions; nothing is taken off. A common motion of all stars is found."""
@@ -508,7 +516,7 @@ def test_motions_of_a_catalogue_that_disagree():
     assert solve(sim.matches, motion="proper", reference=places).gauge.drift.n_tied == 0
 
 
-@pytest.mark.parametrize("sky", [None, SKY])
+@pytest.mark.parametrize("sky", [pytest.param(None, marks=pytest.mark.slow), SKY])
 def test_pictures_of_motions(sky):
     solution = solve(field(60, sky=sky).matches, motion="proper")
     ax = motion_plots.plot_motions(solution)

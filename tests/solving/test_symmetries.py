@@ -193,7 +193,7 @@ def turned(one, linear, shift):
     return replace(one, poses=poses, reference=known)
 
 
-PLANES = {
+PLANES = {  # reflections alone by default
     "shifted": (np.eye(2), np.array([1234.5, -777.7])),
     "turned": (np.array([[0.0, -1.0], [1.0, 0.0]]), np.zeros(2)),
     "scaled": (1.02 * np.eye(2), np.zeros(2)),
@@ -201,7 +201,9 @@ PLANES = {
 }
 
 
-@pytest.mark.parametrize("plane", PLANES)
+@pytest.mark.parametrize(
+    "plane", [pytest.param(name, marks=[pytest.mark.slow] * (name != "mirrored")) for name in PLANES]
+)
 @pytest.mark.parametrize(("setting", "seed"), cases())
 def test_the_plane(setting, seed, plane, solved):
     """What counts as unknown has an error beyond a pixel of the plane, which is another one where that is scaled."""

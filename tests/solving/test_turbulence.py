@@ -72,6 +72,7 @@ def test_what_it_found_is_in_distortion_wcs_and_file(turbulent, tmp_path):
     assert np.all(known.relative[:, 0, 0] > 0.01**2)
 
 
+@pytest.mark.slow
 def test_it_takes_itself_away():
     """White noise alone has no field, and nothing changes."""
     free = sky(32, n_stars=40, n_exposures=6)
@@ -105,6 +106,7 @@ def test_the_covariance_is_that_of_a_gradient(nu):
     assert np.linalg.eigvalsh(kernel(places, places)).min() > 0
 
 
+@pytest.mark.slow
 def test_a_field_that_is_drawn_out_is_seen_so():
     """Its axis and ratio, of one that is made by its own covariance in numpy."""
     stretch = np.log(3.0) * np.array([np.cos(np.radians(60)), np.sin(np.radians(60))])
@@ -164,6 +166,7 @@ def one_exposure(seed, *, rms, n_known=400, n_others=60):
     return ld.Matches.from_table(table, shape=(2048, 2048)), catalogue, stars
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the offsets of the stars from the reference")
 def test_one_exposure_has_its_field_from_a_catalogue():
     """Stars that the catalogue has not are right within their errors, and so is the factor on stated errors."""

@@ -120,10 +120,10 @@ def wcs_in(path, number=1):
 @pytest.mark.parametrize(
     ("degree", "peak", "place"),
     [
-        (3, 5, {}),
-        (3, 20, {"lat": 89.9, "lon": 123.0}),
-        (3, 100, {"lon": 0.0}),
-        (5, 5, {"lat": -89.9, "parity": 1}),
+        pytest.param(3, 5, {}, marks=pytest.mark.slow),
+        pytest.param(3, 20, {"lat": 89.9, "lon": 123.0}, marks=pytest.mark.slow),
+        pytest.param(3, 100, {"lon": 0.0}, marks=pytest.mark.slow),
+        pytest.param(5, 5, {"lat": -89.9, "parity": 1}, marks=pytest.mark.slow),
         (5, 20, {"lon": 0.0, "turn": 170.0}),
         (5, 100, {"lat": -60.0, "parity": 1}),
     ],
@@ -922,7 +922,7 @@ def check_nothing_happened(solution, paths, folder, before):
     assert everything(folder).keys() == before.keys()
 
 
-@pytest.mark.parametrize("good", [0, 1, 2])
+@pytest.mark.parametrize("good", [0, pytest.param(1, marks=pytest.mark.slow), 2])
 def test_frames_are_changed_all_or_none(three, tmp_path, monkeypatch, good):
     solution, paths = three
     before, usual, written = everything(tmp_path), attachment._Plan.write, []
@@ -982,6 +982,7 @@ def test_copies_come_together_beside_other_files(three, tmp_path, monkeypatch):
     assert all(map(has_wcs, out.glob("*.fits")))
 
 
+@pytest.mark.slow
 def test_what_is_unknown_of_the_sky_and_maps_left_behind_are_said(tmp_path, caplog):
     """One line with the largest move of a star by 1 px of what is unknown; none where a prior determines all."""
     night = legdistort.simulate_exposures(small=True, n_exposures=4, seed=4)

@@ -181,6 +181,7 @@ def test_a_model_that_cannot_be_refined_is_named(night, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_catalogues_with_the_wcs_of_their_images(night, tmp_path, capsys):
     """Lists as `photutils` writes them beside the images of a pipeline: sky, shape and time are those of the images."""
     from legdistort.cli import main
