@@ -261,6 +261,7 @@ def test_an_odd_night_among_others_that_were_solved_with_it_is_left_out():
     assert len(ld.combine_nights([combined, left_out]).nights) == 2
 
 
+@pytest.mark.slow
 def test_of_two_that_contradict_one_another_neither_is_odd(three):
     other = solved(4242, static(1) + curved(5, 0.7))
     two = ld.combine_nights([three[0], other])
@@ -280,6 +281,7 @@ def test_an_odd_night_is_named_and_counts_less():
     assert "Odd nights, which count less: solution 4." in str(combined)
 
 
+@pytest.mark.slow
 def test_what_nights_of_one_orientation_do_not_determine_hides_no_odd_night(tmp_path):
     """Some combinations of modes are unknown, to the coefficients of all of them: the others are known well."""
     nights = [solved(600 + i, static(3) + curved(650 + i, 0.02), turns=(0,), year=2014 + i) for i in range(4)]

@@ -140,7 +140,10 @@ def test_shift_turn_scale_and_parity_do_not_matter(shape):
     assert found.agrees
 
 
-@pytest.mark.parametrize("known", ["nothing", "old", "wrong", "fit"])
+@pytest.mark.parametrize(
+    "known",
+    ["nothing", pytest.param("old", marks=pytest.mark.slow), pytest.param("wrong", marks=pytest.mark.slow), "fit"],
+)
 def test_what_a_night_was_solved_with_does_not_count(known):
     how = {"nothing": {}, "old": {"prior": old(5)}, "wrong": {"prior": ld.Prior(1.3 * modes(static(5)))},
            "fit": {"static": "fit"}}[known]  # fmt: skip
@@ -208,6 +211,7 @@ def test_maps_of_other_kinds_and_of_other_detectors():
         ld.difference(prior, ld.Prior(None, static_sigma=1.0))
 
 
+@pytest.mark.slow
 def test_the_command_compares_files(tmp_path, capsys):
     solution = solved(9)
     solution.write(tmp_path / "night.asdf")
@@ -241,6 +245,7 @@ def four(seed, extra=0.0):
     return ld.Camera("as made", chips)
 
 
+@pytest.mark.slow
 def test_a_night_of_a_camera_is_compared_detector_by_detector():
     matches = four_detectors.matches("static", 1)
     night = ld.solve(matches, static="fit", layout="fit", degree=2)

@@ -120,6 +120,7 @@ def test_stars_of_other_names_are_found_by_their_places():
     assert ld.difference(first, solved(Nights(4, nights=2, per=3, n_stars=120).table)).stars is None  # another field
 
 
+@pytest.mark.slow
 def test_frames_that_were_measured_anew_are_the_same():
     nights = Nights(3, nights=2, per=3, n_stars=100, roll=0.0)
     again = nights.table.copy()
@@ -130,6 +131,7 @@ def test_frames_that_were_measured_anew_are_the_same():
     assert ld.difference(first, solved(again)).shared == ()
 
 
+@pytest.mark.slow
 def test_a_camera_of_nights_knows_which_it_has(tmp_path):
     table = Nights(6, nights=4, per=4, n_stars=100).table
     nights = [solved(table[table["block"] == k]) for k in range(4)]

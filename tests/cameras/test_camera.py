@@ -530,6 +530,7 @@ class TestFittedCamera:
             assert legdistort.solve(next_night, layout=layout).gauge.unknown_names == ("shear",)
         assert legdistort.solve(legdistort.Matches.from_table(table, camera=gsaoi)).gauge.unknown_names == ()
 
+    @pytest.mark.slow
     def test_a_mismatch_does_not_move_the_camera(self, gsaoi):
         night = gsaoi_images.Night(n_stars=400, dither=6.0)
         table = night.table(sigma=SIGMA)

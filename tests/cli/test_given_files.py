@@ -55,6 +55,7 @@ def test_an_odd_night_is_a_failure_which_its_name_cures(tmp_path, capsys):
     assert "none of the nights: 2014-05-27, " in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_stated_pixel_scale_gives_figures_in_mas(tmp_path, capsys):
     table = Nights(5, nights=3, per=2, roll=0.7, n_stars=100, motion=0.05).table
     table.write(tmp_path / "m.ecsv")

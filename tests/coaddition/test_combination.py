@@ -138,7 +138,7 @@ class TestClipping:
         assert np.mean(found) > least
         assert abs(left) < 0.25 * put
 
-    @pytest.mark.parametrize("k", [4, 11])
+    @pytest.mark.parametrize("k", [4, pytest.param(11, marks=pytest.mark.slow)])
     def test_cosmic_rays_on_stars_are_found(self, k):
         widths = np.full(k, 2.5)
 

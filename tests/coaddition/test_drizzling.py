@@ -56,6 +56,7 @@ def test_exposures_together():
     check_stars(mosaic, stars - mosaic.offset, flux, position=0.03, relative=0.005)
 
 
+@pytest.mark.slow
 def test_small_drops_are_sharper():
     solution, stars, flux = scene(8, rolls=range(8), spread=4, peak=5.0)
     exposures = expose(solution, stars, flux)

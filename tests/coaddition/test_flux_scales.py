@@ -288,7 +288,7 @@ class TestSaturation:
         scale = {f"frame{i}": 1 / d for i, d in enumerate(depth)}
         return solution, stars, flux * 3, out, scale
 
-    @pytest.mark.parametrize("method", ["mean", "clipped"])
+    @pytest.mark.parametrize("method", [pytest.param("mean", marks=pytest.mark.slow), "clipped"])
     def test_the_short_exposure_fills_the_cores(self, method):
         solution, stars, flux, frames, scale = self.frames()
         mosaic = coadd(frames, solution, scale=scale, method=method, match_background=False)
@@ -329,6 +329,7 @@ class TestSaturation:
 
 
 class TestBackground:
+    @pytest.mark.slow
     def test_gradients_leave_no_steps(self):
         """Skies with one gradient and different levels: flat residuals to less than the noise, whatever overlaps."""
         solution, stars, flux = scene(6, rolls=(0, 1, -1, 2, -2, 1), spread=40)

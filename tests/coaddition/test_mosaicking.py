@@ -119,7 +119,7 @@ class TestReferencePlane:
             mosaic = coadd([Exposure(name, image)], solution, algorithm=algorithm, match_background=False)
             assert np.nansum(mosaic.data) == pytest.approx(3e4, rel=2e-3), algorithm
 
-    @pytest.mark.parametrize("algorithm", ["adaptive", "exact"])
+    @pytest.mark.parametrize("algorithm", ["adaptive", pytest.param("exact", marks=pytest.mark.slow)])
     def test_other_algorithms(self, algorithm):
         solution, stars, flux, exposures, _ = plain()
         mosaic = coadd(exposures[:1], solution, algorithm=algorithm)
@@ -132,6 +132,7 @@ class TestSky:
         sky = mosaic.wcs.pixel_to_world(*(stars - mosaic.offset).T)
         assert solution.sky.to_sky(stars).separation(sky).max() < 1e-9 * u.deg
 
+    @pytest.mark.slow
     def test_other_grid_through_the_gwcs(self):
         solution, stars, flux, exposures, _ = plain()
         grid = WCS(naxis=2)
@@ -207,7 +208,7 @@ class TestSky:
         edge = [inner[:, [0, -1]].reshape(2, -1), inner[:, :, [0, -1]].reshape(2, -1)]
         np.testing.assert_allclose(along, np.concatenate(edge, axis=1), atol=1e-11)
 
-    @pytest.mark.parametrize("axis", [0, 1])
+    @pytest.mark.parametrize("axis", [pytest.param(0, marks=pytest.mark.slow), 1])
     def test_pieces_know_which_pixels_lie_on_the_detector(self, axis):
         """Also where the distortion, beyond where it is valid, folds back onto the detector, a long and narrow one."""
         shape, far = ((120, 400), 200) if axis else ((400, 120), -200)
@@ -671,6 +672,7 @@ class TestBadInput:
         history = str(fits.getheader(tmp_path / "m.fits")["HISTORY"])
         assert "left out n\\xe9: it is not in the solution" in history
 
+    @pytest.mark.slow
     def test_a_coarse_grid_is_for_other_algorithms(self):
         solution, *_, exposures, mosaic = plain()
         grid = mosaic.wcs.deepcopy()

@@ -110,6 +110,7 @@ def test_any_shared_wcs_leads_to_the_sky(kind):
     assert_allclose(to_icrs(found, xy), [expected.ra.deg, expected.dec.deg], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_gwcs_gives_pose_sky_and_distortion():
     """Poses are those that went in; what the header has of distortion is measured."""
     exposures = [

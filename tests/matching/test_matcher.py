@@ -81,6 +81,7 @@ def test_stars_in_corners_where_few_pairs_tell_the_map(flips, seed):
     assert_good(table, match(table, shape=SHAPE))
 
 
+@pytest.mark.slow
 def test_exposures_that_fit_no_single_one_fit_the_stars_of_all():
     table = make_field(20, *six_poses(30, 20, 6), seed=6, common=0.7, spurious=1.0, flips=FLIPS)
     names = [f"e{k:02d}" for k in range(6)]
@@ -163,6 +164,7 @@ def test_flips(angles):
     assert np.array_equal(np.array(parities) * parities[0], [1, -1, 1, -1, 1, 1])
 
 
+@pytest.mark.slow
 def test_depths_differ():
     table = make_field(600, *six_poses(20, 200), seed=6, depth=[1, 0.2, 1, 0.5, 0.2, 1])
     assert_good(table, match(table, shape=SHAPE))
@@ -195,6 +197,7 @@ def test_exposure_with_too_few_detections_is_left_out():
     assert "only 2 usable detections" in matches.left_out["poor"]
 
 
+@pytest.mark.slow
 def test_unrelated_lists_do_not_match():
     rng = np.random.default_rng(8)
     for n, m in [(30, 200), (20, 20), (100, 100), (200, 200)]:
@@ -222,6 +225,7 @@ def test_hot_pixels_do_not_become_stars():
     assert np.mean(matches.table["truth"] < 0) < 0.01
 
 
+@pytest.mark.slow
 def test_hot_pixels_under_a_slow_drift():
     shifts = 0.35 * np.arange(12)[:, None] * np.array([1, 0.4])
     table = make_field(100, np.zeros(12), shifts, seed=7, spurious=0, peak=2)
@@ -270,6 +274,7 @@ def test_headers_give_poses_and_sky():
     assert abs(first["rotation"]) < 0.2
 
 
+@pytest.mark.slow
 def test_rolled_frames_with_headers():
     table, exposures, _ = header_case(np.random.default_rng(5).normal(0, 15, (6, 2)))
     matches = match(table, exposures=exposures)
@@ -280,6 +285,7 @@ def test_rolled_frames_with_headers():
     assert turned == pytest.approx(90, abs=0.3)
 
 
+@pytest.mark.slow
 def test_one_wrong_header_does_no_harm():
     table, exposures, _ = header_case(np.zeros((6, 2)), wrong=[2])
     with warns_here(AssumptionWarning, match="the header WCS of e02 contradicts the stars"):
@@ -302,7 +308,7 @@ def test_headers_all_wrong_are_ignored_with_a_warning():
     "wrong",
     [
         pytest.param({"scale": 0.026 / 3600}, marks=pytest.mark.slow),
-        {"flip": True},
+        pytest.param({"flip": True}, marks=pytest.mark.slow),
         pytest.param({"error": (1229, -1229)}, marks=pytest.mark.slow),
         {"angle": 12},
     ],
@@ -328,6 +334,7 @@ def test_some_exposures_without_wcs():
     assert matches.sky is not None
 
 
+@pytest.mark.slow
 def test_min_exposures_and_columns():
     table = make_field(100, *six_poses(0.5, 100), seed=1)
     sizes = {k: len(match(table, shape=SHAPE, min_exposures=k).stars) for k in (2, 4, 6)}
@@ -509,6 +516,7 @@ def test_real_star_lists(shared_data):
     assert abs(abs(shift[1] - shift[2]) - 250) < 3
 
 
+@pytest.mark.slow
 def test_real_frames(shared_data):
     photutils = pytest.importorskip("photutils.detection")
     from astropy.io import fits

@@ -34,7 +34,12 @@ def found(centres, xy, fwhm):
 
 
 @pytest.fixture(
-    scope="module", params=[{"strehl": 0.1}, {"strehl": 0.3, "halo_fwhm": 12.0}, {"strehl": 0.5, "coma": 0.4}]
+    scope="module",
+    params=[
+        {"strehl": 0.1},
+        pytest.param({"strehl": 0.3, "halo_fwhm": 12.0}, marks=pytest.mark.slow),
+        pytest.param({"strehl": 0.5, "coma": 0.4}, marks=pytest.mark.slow),
+    ],
 )
 def psf(request):
     """Of a pupil, over 512 x 512 px."""
@@ -153,6 +158,7 @@ def test_one_width_and_one_position_in_all_cut_outs_of_a_crowded_field(saturated
         assert np.sqrt(np.mean(off**2)) < 0.02
 
 
+@pytest.mark.slow
 def test_a_width_that_no_star_has_is_an_error_within_seconds():
     """Structure of a raw frame, far above the noise and without a star."""
     rng, size = np.random.default_rng(1), 768

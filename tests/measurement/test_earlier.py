@@ -48,6 +48,7 @@ def test_the_same_is_the_same(night, tmp_path):
     assert again.solution.provenance["inputs"] == first.provenance["inputs"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unmeasured")
 def test_other_options_and_fewer_frames(night, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -536,6 +536,7 @@ def test_written_files_read_back_and_are_read_by_photutils(psf, tmp_path):
     assert ld.measure(night()[0], psf=tmp_path / "grid.fits")["psf"][0] == "array"
 
 
+@pytest.mark.slow
 def test_a_psf_for_every_exposure(psf, tmp_path):
     """A folder or a dict has one for each name; what lacks is an error that says whose."""
     (tmp_path / "out").mkdir()
@@ -678,6 +679,7 @@ def test_the_report_shows_the_psf(psf):
     assert "effective PSF" not in render(solution, psfs={})
 
 
+@pytest.mark.slow
 def test_the_command_measures_with_it_and_writes_it(tmp_path, psf):
     from legdistort.cli import main
 

@@ -73,7 +73,7 @@ def test_errors_grow_with_the_photons_of_the_halo():
     assert ratio > 1.5
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0])
+@pytest.mark.parametrize("factor", [pytest.param(0.5, marks=pytest.mark.slow), 2.0])
 def test_a_wrong_gain_does_not_make_the_sky_noisy(factor):
     """Model wrong: the noise of the sky is seen in the image, whatever the gain says."""
     rng = np.random.default_rng(23)

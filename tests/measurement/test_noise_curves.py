@@ -103,6 +103,7 @@ def test_errors_stated_by_fits_are_those_that_were_made(curves):
     assert (found[3:] > 0.97).all()
 
 
+@pytest.mark.slow
 def test_wide_stars_are_known_less_well():
     widths = [3.5, 4.5, 6.0]
     curves = ld.calibrate_noise(field(2), fwhm=widths, fluxes=[1e4, 1e5], n_positions=60)
@@ -220,6 +221,7 @@ def test_missing_gain_is_estimated_and_said():
     assert given.table.meta["photon"]["field4"] == 1 / GAIN
 
 
+@pytest.mark.slow
 def test_uncertainty_plane_tells_the_photon_noise():
     exposure = field(5, n=20, size=340)
     clean = np.maximum(exposure.data, 0)

@@ -40,6 +40,7 @@ def test_spots_arms_and_speckles_are_no_stars(frame, found):
     assert (cKDTree(xy).query(frame.xy)[0] < 0.6 * frame.fwhm)[frame.snr > 10].all()
 
 
+@pytest.mark.slow
 def test_stars_whose_tops_are_saturated_have_the_same_structure(frame):
     level = np.sort(frame.data[tuple(np.round(frame.xy).astype(int).T[::-1])])[-3]
     _, xy = measured(frame, saturation=level)

@@ -101,6 +101,7 @@ def test_stars_at_another_time_are_those_of_a_solution_of_that_time(tied):
     assert there.meta["epoch"] == 2018.0
 
 
+@pytest.mark.slow
 def test_stars_at_another_time_need_motions():
     with pytest.raises(InputError, match="motions of the stars were not fitted"):
         solve(field(40).matches).stars_at(2018.0)
@@ -212,6 +213,7 @@ def test_a_table_of_positions_carried_on_in_the_shell(moving, tmp_path):
         solution.correct_table(table, epoch=2021.0)
 
 
+@pytest.mark.slow
 def test_a_stack_of_one_epoch_shows_the_stars_of_that_time():
     """Of the exposures of 2019 alone; where stars are then, not at the epoch of the solution."""
     settings = {"small": True, "n_stars": 80, "motion": 1.5, "epochs": SIX, "dynamic_rms": 0.1}

@@ -252,7 +252,7 @@ def test_two_commands_at_once(table, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["matched.ecsv", "out"]
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")  # of threads of other tests, which sleep
 def test_a_solution_in_another_process(solution, method):
     if method not in multiprocessing.get_all_start_methods():

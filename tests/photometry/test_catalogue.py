@@ -204,6 +204,7 @@ def test_what_one_exposure_alone_shows_is_no_star():
     assert np.argwhere(spoiled).tolist() == [[6, 5]]
 
 
+@pytest.mark.slow
 def test_a_hit_on_a_faint_star_is_left_out(truth, solution, found):
     """And a flash of one exposure; a star that brightens in two varies; what one of them alone shows is none."""
     frames = [frame.copy() for frame in truth.frames]

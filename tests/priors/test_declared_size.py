@@ -186,6 +186,7 @@ def test_it_is_said_once_that_absolute_positions_are_not_known(sim, declared, ca
     assert "Relative error of the correction" in render(free)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_solve_command(sim, tmp_path, capsys):
     table = QTable(sim.matches.table)

@@ -361,6 +361,7 @@ def test_siaf_without_pysiaf(monkeypatch):
 # --- truncation, directions, units ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_truncation_is_true(shared_data, nirc2):
     """Not smaller than by another evaluation on 500 x 500 points, corners included."""
     bump = {"shape": (300, 400), "direction": FORWARD}  # 25 px wide, so that a coarse grid steps over its top

@@ -92,6 +92,7 @@ def sip_night(night, tmp_path_factory):
     return frames
 
 
+@pytest.mark.slow
 def test_the_prior_of_headers_is_that_of_the_file(tmp_path):
     exposures = [exposure(k) for k in range(3)]
     prior = ld.Prior.from_headers(exposures, degree=3, sigma=0.1, static_sigma=0.2)
@@ -151,6 +152,7 @@ def test_headers_that_differ_give_each_its_own():
         ld.Prior.from_headers([exposure(0), exposure(1, sip=small), exposure(2, sip=None)])
 
 
+@pytest.mark.slow
 def test_series_end_at_the_highest_degree_of_sip():
     steep = {"A_ORDER": 9, "B_ORDER": 9, "A_9_0": 5e-18, "B_0_9": 5e-18}
     prior = ld.Prior.from_headers([exposure(0, sip=steep)])
@@ -200,6 +202,7 @@ def test_the_size_is_that_over_the_detector():
         assert (told_of([exposure(0, sip=tiny)]) is not None) == told
 
 
+@pytest.mark.slow
 def test_a_distortion_that_is_not_used_is_said():
     table, _ = positions()
     exposures = [exposure(k) for k in range(6)]

@@ -208,6 +208,7 @@ def test_a_rough_map_is_not_truncated(mask, rough_prior, tmp_path):
     assert_allclose(again.mean, rough_prior.mean, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_solutions_follow_it(mask, rough_prior):
     """Exposures that are known to have this distortion and no more: the residuals are noise."""
     how = {"static": "hold", "exposure_degree": None, "degree": 5}

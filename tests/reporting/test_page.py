@@ -279,7 +279,9 @@ def test_trailed_exposures_have_a_row_and_are_marked(solution, tables_only):
     assert "trailed" not in report.render(solution)
 
 
-@pytest.mark.parametrize("degree", [1, 2, 6])
+@pytest.mark.parametrize(
+    "degree", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(6, marks=pytest.mark.slow)]
+)
 def test_two_exposures_without_flux_prior_or_mosaic(degree):
     solution = make_solution(2, 30, degree, flux=False, prior=False)
     page = Page(report.render(solution))

@@ -74,6 +74,7 @@ def test_every_exposure_is_in_figures():
     assert found["detectors"] == []
 
 
+@pytest.mark.slow
 def test_a_night_has_what_its_exposures_have_in_common():
     """One night is 3 px off a mode: that is its figure, and none of the others have a part of it."""
     table = Nights(2, nights=7, per=3, n_stars=120, odd=3.0, roll=0.0).table

@@ -102,6 +102,7 @@ def relative(dense, solution):
     return take_off @ dense.by_layouts() @ take_off.T
 
 
+@pytest.mark.slow
 def test_coefficients(solution, dense, relative):
     """The covariance of every exposure is that of a known camera, and what the layouts add."""
     for i, name in enumerate(solution.names):

@@ -136,7 +136,9 @@ def test_understated_errors_do_not_contradict_the_convention():
     assert solution.gauge.released is None
 
 
-@pytest.mark.parametrize("seeing", [{"dither": 50.0, "dynamic": 0.01}, {"dither": 0.0, "dynamic": 0.1}])
+@pytest.mark.parametrize(
+    "seeing", [pytest.param({"dither": 50.0, "dynamic": 0.01}, marks=pytest.mark.slow), {"dither": 0.0, "dynamic": 0.1}]
+)
 def test_a_large_static_distortion_is_no_misfit(seeing):
     """10 px in all exposures, 0.1 to 1.5 px in which they differ, positions good to 0.01 px."""
     solution = solve(simulate_matches(seed=1, sigma=0.01, static=10.0, n_stars=300, **seeing).matches)
@@ -229,6 +231,7 @@ def _with_mismatches(seed, fraction):
     return sim, table, wrong
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.* no position, the observations contradict one another")
 def test_gross_mismatches_cost_nothing():
     """10 % of the positions off by up to 50 px: within 5 % of the data with these taken out by hand."""

@@ -651,6 +651,7 @@ def races(folder):
         assert [path.name for path in out.parent.iterdir()] == ["out"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
 def test_two_writers_at_once_are_one_after_the_other(tmp_path):
     # forked from a small process without threads

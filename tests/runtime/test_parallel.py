@@ -516,8 +516,8 @@ class TestMosaicInBlocks:
         [
             {"order": 3, "method": "clipped"},
             {"order": 1},
-            {"order": 5, "method": "median"},
-            {"algorithm": "adaptive"},
+            pytest.param({"order": 5, "method": "median"}, marks=pytest.mark.slow),
+            pytest.param({"algorithm": "adaptive"}, marks=pytest.mark.slow),
             {"algorithm": "drizzle"},
             pytest.param({"algorithm": "exact"}, marks=pytest.mark.slow),
         ],

@@ -96,6 +96,7 @@ def test_a_frame_that_changes_while_it_is_read(pair, monkeypatch, swap, reading)
         ld.open_exposures(pair[0]) if reading == "first" else handle.read()
 
 
+@pytest.mark.slow
 def test_a_run_whose_frame_is_swapped_leaves_nothing(tmp_path, monkeypatch):
     """The new frame has the shape of the old one, and would have passed for it."""
     paths = simulate_exposures(small=True, seed=3).write(tmp_path / "frames")

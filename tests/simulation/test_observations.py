@@ -353,6 +353,7 @@ def test_written_files_are_read_as_exposures(small, tmp_path):
     assert table["ra"].unit == "deg"
 
 
+@pytest.mark.slow
 def test_unknown_setting_is_named():
     with pytest.raises(InputError, match="unknown setting 'dithers'; a night has n_exposures"):
         simulate_exposures(dithers=3)

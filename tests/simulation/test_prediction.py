@@ -55,7 +55,7 @@ def assert_agrees(n_im, n_star, sigma, n, *, tolerance, accuracy):
     assert_allclose([prediction.b, prediction.sigma] / measured, 1, atol=tolerance)
 
 
-@pytest.mark.parametrize(("n_im", "n_star", "n"), [(10, 30, 20), (2, 40, 30)])
+@pytest.mark.parametrize(("n_im", "n_star", "n"), [pytest.param(10, 30, 20, marks=pytest.mark.slow), (2, 40, 30)])
 def test_agrees_with_monte_carlo(n_im, n_star, n):
     assert_agrees(n_im, n_star, 0.14, n, tolerance=0.06, accuracy=0.025)
 

@@ -148,6 +148,7 @@ def test_a_field_that_is_far_smaller_than_the_noise_changes_nothing():
     assert_allclose(turbulent.solution.stars["x_err"], plain.solution.stars["x_err"], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_absolute_errors_grow_with_the_field_and_fall_with_exposures():
     """And what is stated of the scatter of the series beside adds to it."""
     exact = ld.Prior(np.zeros((2, 1)))
@@ -166,6 +167,7 @@ def test_absolute_errors_grow_with_the_field_and_fall_with_exposures():
     assert np.isnan(ld.predict(n_exposures=6, **given, terms=ld.Term.named("pixel_phase", sigma=0.01)).b_abs)
 
 
+@pytest.mark.slow
 def test_it_is_said_and_kept():
     p = ld.predict(n_exposures=8, n_stars=40, sigma=SIGMA, dithers=60.0, n_grid=6,
                    terms=ld.Term.named("turbulence", size=0.1, length=300))  # fmt: skip

@@ -40,7 +40,7 @@ def test_diffraction_pattern_is_that_of_an_annulus(obstruction):
         assert 2 * half / 24 == pytest.approx(1.029, rel=5e-3)
 
 
-@pytest.mark.parametrize("strehl", [0.05, 0.6])
+@pytest.mark.parametrize("strehl", [pytest.param(0.05, marks=pytest.mark.slow), 0.6])
 def test_strehl_ratio_and_halo(strehl):
     """Peak over that without turbulence; what the core does not hold lies in a halo as wide as the seeing."""
     kinds = {"resolution": 10.0, "halo_fwhm": 200.0, "jitter": 1.0, "obstruction": 0.0}
@@ -219,6 +219,7 @@ def test_bound_of_a_gaussian_is_the_textbook_one(sky, read_noise):
     np.testing.assert_allclose(known, bound, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_a_fit_with_the_true_psf_reaches_the_bound():
     """Of 40 stars of all brightnesses; what deviates is 1 to 3 standard deviations of so few."""
     frame = ao_images.frame("symmetric", 0.3, 1, n=40, size=512)

@@ -45,6 +45,7 @@ def test_what_is_wrong_of_a_camera_is_named_with_its_cure(kind):
     assert check.cure == four_detectors.CURES[kind]
 
 
+@pytest.mark.slow
 def test_what_is_fitted_is_not_asked_about():
     matches = four_detectors.matches("layout", 0)
     assert check_of(matches, layout="fit").state == "pass"

@@ -54,6 +54,7 @@ def similarities(sky):
     return np.stack([np.stack(d, axis=1).ravel() for d in ((one, no), (no, one), (x, y), (-y, x))], axis=1)
 
 
+@pytest.mark.slow
 def test_layouts_to_begin_with_do_not_matter():
     """Detectors that lie wrong by pixels, or right: the same stars and detectors."""
     field, found = gsaoi_calibration.night(0.0), []

@@ -36,7 +36,9 @@ def at(values, covariance, years):
     return values @ step.T, step @ covariance @ step.T
 
 
-@pytest.mark.parametrize(("kind", "epochs"), [("proper", THREE[::2]), ("parallax", FIVE[::2])])
+@pytest.mark.parametrize(
+    ("kind", "epochs"), [pytest.param("proper", THREE[::2], marks=pytest.mark.slow), ("parallax", FIVE[::2])]
+)
 def test_the_dense_oracle_agrees(kind, epochs):
     """Posterior means and covariances, where the catalogue says more of the common maps than anything else."""
     exposures = {"n_exposures": len(epochs), "rotations": np.linspace(0, 40, len(epochs)), "epochs": epochs}
@@ -100,6 +102,7 @@ def test_absolute_errors_are_calibrated(n, kind, sigma, accuracy):
     assert_allclose(ratio, 1, atol=accuracy)
 
 
+@pytest.mark.slow
 def test_stars_of_the_catalogue_have_what_it_knows_of_them():
     """Where the exposures know less the catalogue rules; a star seen once has its motion."""
     sim = field(60, sigma=0.1)
@@ -130,6 +133,7 @@ def test_a_tie_settles_where_the_scatter_of_motions_is_known():
     assert "not settled" not in solution.status
 
 
+@pytest.mark.slow
 def test_a_table_of_stars_is_a_prior_of_its_motions():
     """Columns of motions in pixels, with their correlations, serve as those on the sky do."""
     sim = field(60, sky=None)

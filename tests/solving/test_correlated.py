@@ -55,6 +55,7 @@ def wandering():
     return {errors: solved(matches, errors) for errors in ("floor", "correlated")}, truth
 
 
+@pytest.mark.slow
 def test_errors_of_stars_that_wander_are_true(wandering):
     solutions, truth = wandering
     assert true_over_reported(solutions["floor"], truth) > 1.5
@@ -92,6 +93,7 @@ def test_covariance_of_all_stars_has_that_of_each_on_its_diagonal(wandering):
     assert np.diag(uncertainty.star_matrix[:n, n:]) == pytest.approx(uncertainty.stars[2], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_times_tell_what_the_order_of_the_exposures_does_not():
     matches, truth = drifting(4, epochs=True)
     assert matches.times[1] == "days"

@@ -44,7 +44,7 @@ def assert_cured(kind, seed):
         assert "found here" in after["chi2"].sentence
 
 
-@pytest.mark.parametrize("kind", ["half", "one for all", "degree"])
+@pytest.mark.parametrize("kind", ["half", "one for all", pytest.param("degree", marks=pytest.mark.slow)])
 def test_the_cure_that_is_named_cures(kind):
     assert_cured(kind, 0)
 
@@ -79,6 +79,7 @@ def test_what_a_degree_leaves_of_turbulence_is_foretold_in_other_sets(size, seed
     assert about or size < 3
 
 
+@pytest.mark.slow
 def test_motions_are_the_cure_of_all_that_they_cause():
     """Places, degrees and errors do not pass either where stars move; fitting their motions brings what is promised."""
     data, rng = dense_model.drawn_set(1)[0], np.random.default_rng(1)

@@ -285,6 +285,7 @@ def test_the_registration_of_degree_zero_is_made_without_the_stars_left_out_wher
     assert chosen.scores[0] == pytest.approx(slow[:, 0].sum() / slow[:, 1].sum(), rel=1e-3 if best == 0 else 0.3)
 
 
+@pytest.mark.slow
 def test_of_equal_degrees_the_lowest():
     """With widths that are found, degrees that are not there change nothing."""
     sim = simulate(12, 0.5, 0.5, n_exposures=5)

@@ -140,6 +140,7 @@ def test_a_rolled_field_tells_the_shear_of_another():
     assert np.isfinite(both.stars["x_err_abs"]).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_order_of_fields_does_not_matter():
     data, truth = field_sets.drawn_fields(2, dynamic=0.3)
     n_stars, n = len(truth["stars"]), len(data["poses"])

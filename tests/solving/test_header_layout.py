@@ -29,6 +29,7 @@ def near():
     return night, legdistort.match(night.table, exposures=night.exposures)
 
 
+@pytest.mark.slow
 def test_a_prior_of_one_detector_of_several_is_refused_with_what_to_do(near):
     _, matches = near
     prior = legdistort.Prior(np.zeros((2, 6)), shape=next(iter(matches.camera.detectors.values())).shape)
@@ -292,6 +293,7 @@ def test_ties_are_counted_and_few_are_told(near):
     assert "more stars" in camera.cure
 
 
+@pytest.mark.slow
 def test_stated_widths_determine_it(apart):
     """Shifts known to 2.5 px stand for what no star tells: finite errors, no groups."""
     camera = legdistort.Camera.of_frames(apart.exposures)
@@ -369,6 +371,7 @@ def test_what_the_caller_knows_of_the_layout(n_sets):
     assert pull_across(n_sets, layout_sigma=WIDTHS) == pytest.approx(1, abs=0.5 if n_sets < 10 else 0.2)
 
 
+@pytest.mark.slow
 def test_the_caller_s_widths_are_those_of_a_camera(apart):
     """In pixels of the modes; without an error of the scale that is as large as the rotation's, in radians."""
     matches, turn = known_stars(apart), np.radians(0.02) * header_layouts.SIZE / np.sqrt(3)

@@ -112,7 +112,10 @@ class TestPosterior:
             _ = Posterior(data, part, self.SIZES).mean
 
 
-@pytest.mark.parametrize(("seed", "changes"), [(0, {}), (1, {"rolls": 30.0}), (2, {"n": 6, "dynamic": 0.1})])
+@pytest.mark.parametrize(
+    ("seed", "changes"),
+    [pytest.param(0, {}, marks=pytest.mark.slow), (1, {"rolls": 30.0}), (2, {"n": 6, "dynamic": 0.1})],
+)
 def test_sizes_are_those_of_the_dense_model(seed, changes):
     data, _ = dense_model.drawn_set(seed, n_stars=60, **changes)
     dense = dense_model.Model(**data).fit()
@@ -120,6 +123,7 @@ def test_sizes_are_those_of_the_dense_model(seed, changes):
     assert_allclose(found.sizes, dense.sizes[:4], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_dense_model_reaches_the_errors_at_large_departures():
     """Of the twin itself: 10 px a mode, where a convention held while minimising leaves chi2/dof at 80 and more."""
     data, truth = dense_model.drawn_set(0, dynamic=10.0)

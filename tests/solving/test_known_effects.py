@@ -69,7 +69,7 @@ def test_nothing_is_named_where_nothing_is():
     assert sum(map(bool, found)) <= 5
 
 
-@pytest.mark.parametrize("kind", ["pixel phase", "step"])
+@pytest.mark.parametrize("kind", [pytest.param("pixel phase", marks=pytest.mark.slow), "step"])
 def test_what_would_be_left_without_an_effect_is_what_is_left_without_it(kind):
     """Chi2 that is promised is that of the same set with the pattern taken off by hand."""
     data, shift = known_displacements.displaced(kind, 3)

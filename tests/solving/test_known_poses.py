@@ -210,6 +210,7 @@ def test_it_goes_with(options):
     assert all(np.isfinite(each).all() for each in new[1:])
 
 
+@pytest.mark.slow
 def test_it_is_kept(tmp_path):
     """In the matches' file, in the solution and its file, and by the command line."""
     table, poses, _ = exposures(4, n=4, n_stars=60)

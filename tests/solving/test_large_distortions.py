@@ -216,6 +216,7 @@ def test_errors_beyond_the_degree_are_written_and_scale_with_the_others(tmp_path
     assert_allclose(*relative)
 
 
+@pytest.mark.slow
 def test_gross_errors_are_found_beside_large_distortions():
     data, truth = dense_model.drawn_set(0, static=1.0, dynamic=10.0)
     rng = np.random.default_rng(0)

@@ -88,6 +88,7 @@ def values(solution, name):
     return np.array([*model(*reference), *reference])
 
 
+@pytest.mark.slow
 def test_a_whole_form_is_the_usual_solution(simulation, plain):
     solution = solve(simulation.matches, model=form())
     assert_allclose(solution.coefficients, plain.coefficients, rtol=0, atol=1e-12)

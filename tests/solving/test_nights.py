@@ -209,6 +209,7 @@ def test_the_odd_night_is_named_with_all_its_exposures(tmp_path):
         assert again.nights.pformat() == table.pformat()
 
 
+@pytest.mark.slow
 def test_an_odd_night_is_left_out_by_its_name():
     """By its date, its block, or, where nights have no dates, by its exposures: the cure of the check cures."""
     table = Nights(5, per=2, odd=0.5, roll=0.7).table
@@ -236,6 +237,7 @@ def test_a_file_with_tests_of_other_nights_is_refused(tmp_path):
         ld.Solution.read(tmp_path / "other.asdf")
 
 
+@pytest.mark.slow
 def test_an_odd_night_moves_nothing_of_what_the_others_are_compared_with():
     figures = []
     for odd in (0.5, 3.0):
@@ -282,7 +284,7 @@ def test_nights_are_odd_among_few_and_unlike_ones(words, odd):
         assert table["p"].max() < 1e-6
 
 
-@pytest.mark.parametrize(("size", "named"), [(0.06, False), (0.1, True)])
+@pytest.mark.parametrize(("size", "named"), [pytest.param(0.06, False, marks=pytest.mark.slow), (0.1, True)])
 def test_a_night_is_odd_from_three_times_the_scatter_of_the_others(size, named):
     """However improbable."""
     worst = solved(Nights(3, roll=0.7, odd=size, n_stars=120)).nights[0]
@@ -516,6 +518,7 @@ def odd_night(*, wrong=(), seed=4):
     return ld.Matches.from_table(table, shape=(SIZE, SIZE))
 
 
+@pytest.mark.slow
 def test_a_night_with_another_distortion_is_named_so():
     """Not as mismatched; with the option that made it one of them. The exposure that is mismatched still is."""
     with warnings.catch_warnings(record=True, action="always") as told:

@@ -230,6 +230,7 @@ def test_errors_known_up_to_a_factor():
     assert wrong.diagnostics.error_scale == pytest.approx(2 * again.diagnostics.error_scale, rel=0.01)
 
 
+@pytest.mark.slow
 def test_mismatches_do_not_widen_them():
     sim = simulate(8, "flat", seed=3)
     bad = np.random.default_rng(0).choice(len(sim.matches.table), 3, replace=False)
@@ -264,6 +265,7 @@ def test_one_prior_one_set_of_widths():
     assert len(mixed["even"]) == 3
 
 
+@pytest.mark.slow
 def test_some_of_many_exposures_are_enough(monkeypatch):
     sim = simulate(12, n_exposures=30)
     whole = found(sim).diagnostics.widths
@@ -414,7 +416,9 @@ def test_a_plan_needs_numbers():
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("arguments", [["--prior-sigma", "evidence"], ["--prior-sigma", "0.9"]])
+@pytest.mark.parametrize(
+    "arguments", [pytest.param(["--prior-sigma", "evidence"], marks=pytest.mark.slow), ["--prior-sigma", "0.9"]]
+)
 def test_command_line(arguments, tmp_path, capsys):
     sim = simulate(7)
     table = sim.matches.table.copy()
@@ -511,7 +515,7 @@ def _drawn_to_what_they_show(seed, **words):
     return np.sum(np.abs(offset) ** 2), np.sum(variance), solution
 
 
-@pytest.mark.parametrize(("words", "limit"), [({}, 0.06), ({"n_stars": 16}, 0.12)])
+@pytest.mark.parametrize(("words", "limit"), [({}, 0.06), pytest.param({"n_stars": 16}, 0.12, marks=pytest.mark.slow)])
 def test_without_a_mean_exposures_are_drawn_to_the_static_distortion_that_they_show(words, limit):
     """A static distortion of 1 px a mode, departures of 0.05: about nothing, widths would be of a pixel."""
     square, variance, solution = _drawn_to_what_they_show(1, dynamic=0.05, **words)

@@ -206,7 +206,7 @@ def test_errors_beside_a_map_of_the_reference_alone_are_calibrated(degree, error
     assert squares[:, 0].sum() / squares[:, 1].sum() == pytest.approx(1, abs=0.2)
 
 
-@pytest.mark.parametrize("degree", [2, 3])
+@pytest.mark.parametrize("degree", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_the_degree_that_is_named_cures(degree):
     data, truth = dense_model.drawn_set(2, rolls=30.0, dynamic=0.05)
     table = bent(made_catalogues.catalogue(truth["stars"], 2), truth["stars"], degree, 1.0)

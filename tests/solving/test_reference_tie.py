@@ -507,6 +507,7 @@ def test_without_headers_the_reference_gives_the_sky(night, tied, how):
     assert "arcsec/px, from the reference" in in_tables.sky_sentence(solution)
 
 
+@pytest.mark.slow
 def test_proper_motions_matter(night, tied):
     reference = gaia(night, motion=20.0)
     moved = solve(

@@ -351,6 +351,7 @@ def test_a_file_given_twice_is_one_exposure(frames, tmp_path):
     assert left_out == {"renamed": "its pixels are those of exp00"}
 
 
+@pytest.mark.slow
 def test_the_command_measures_it_once(frames, tmp_path, capsys):
     shutil.copy(frames[0], tmp_path / "renamed.fits")
     out = str(tmp_path / "stars.ecsv")

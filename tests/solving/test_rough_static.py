@@ -86,6 +86,7 @@ def test_errors_of_new_positions_hold_it(mask, solution):
     assert 0.5 < np.median(sigma) / stated < 1.5
 
 
+@pytest.mark.slow
 def test_it_is_a_part_of_the_distortion(mask, solution, tmp_path):
     """Not of what terms displace positions by; in WCS, files and their views, of all exposures alike."""
     assert_allclose(solution.residuals["x_terms"].value, 0, atol=1e-12)

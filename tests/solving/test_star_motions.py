@@ -41,7 +41,8 @@ from legdistort.solving.options import SolveOptions
 
 
 @pytest.mark.parametrize(
-    ("kind", "epochs"), [("proper", np.repeat([2015.3, 2016.5, 2019.2], 2)), ("parallax", FIVE[::2])]
+    ("kind", "epochs"),
+    [pytest.param("proper", np.repeat([2015.3, 2016.5, 2019.2], 2), marks=pytest.mark.slow), ("parallax", FIVE[::2])],
 )
 def test_the_dense_oracle_agrees(kind, epochs):
     """Positions, motions, parallaxes, coefficients and covariances, to the accuracy of both."""
@@ -201,7 +202,7 @@ def test_a_drift_of_the_nominal_poses_is_no_motion():
         assert_allclose(xy, np.column_stack([table["x"].value, table["y"].value]), atol=0.15)
 
 
-@pytest.mark.parametrize(("size", "chosen"), [(0.0, None), (1.1, "proper")])
+@pytest.mark.parametrize(("size", "chosen"), [pytest.param(0.0, None, marks=pytest.mark.slow), (1.1, "proper")])
 def test_auto_decides_by_evidence(size, chosen):
     """Motionless sets stay so, sets whose motions scatter by one error of a star's motion do not.
 
@@ -253,6 +254,7 @@ def test_a_star_seen_at_one_epoch_has_no_motion():
     assert 0.3 < known.stars[7]["vx_err"].value < 0.34  # and that of the map common to the others
 
 
+@pytest.mark.slow
 def test_positions_at_another_time():
     solution = solve(field(60, FIVE, parallax=0.1).matches, motion="parallax")
     moved = positions_at(solution, in_tables.epoch(solution) + 2.0) - solution.estimate.positions
@@ -485,6 +487,7 @@ def test_motions_are_tied_to_a_catalogue_with_parallaxes_too():
     assert_allclose(off, [0.2, -0.1], atol=0.05)
 
 
+@pytest.mark.slow
 def test_a_catalogue_without_motions_serves_stars_that_move_at_its_own_epoch_alone():
     """It was held at the epoch of the positions, years away, and chi2 rose from 1300 to 5 million."""
     sim = field(60)
@@ -602,6 +605,7 @@ def test_positions_motions_and_parallaxes_are_at_the_bound(kind, epochs, realisa
     assert np.all(ratio < 1.05)  # what only residuals of second order tell is unknown to the bound, and held here
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_motions_in_the_shell(tmp_path, capsys):
     field(60).matches.table.write(tmp_path / "matched.ecsv")

@@ -79,7 +79,10 @@ def test_a_term_takes_itself_away():
     assert "orbits: the positions do not show it" in str(alone)
 
 
-@pytest.mark.parametrize(("term", "bent"), [("acceleration", {"acceleration": 0.02}), ("orbits", {"orbits": 3.0})])
+@pytest.mark.parametrize(
+    ("term", "bent"),
+    [("acceleration", {"acceleration": 0.02}), pytest.param("orbits", {"orbits": 3.0}, marks=pytest.mark.slow)],
+)
 def test_stars_on_orbits_are_kept(term, bent):
     """They are named, and no other; their places at any time, and all others, are right within their errors."""
     field = sky(5, years=15.0, n_exposures=20, n_stars=40, **bent)
@@ -303,6 +306,7 @@ def test_errors_are_calibrated(bent, terms):
     assert np.all(there == 1) if bent else np.all(there <= 0.1)
 
 
+@pytest.mark.slow
 def test_accelerations_in_one_word():
     """The same as motions and the term, beside other terms too."""
     bent = sky(11, acceleration=0.02, n_stars=30, n_exposures=12, years=15.0)

@@ -23,6 +23,7 @@ def turbulent():
     return field, others, field.solve(terms="turbulence")
 
 
+@pytest.mark.slow
 def test_stars_are_as_good_as_who_knows_the_covariance_has_them(turbulent):
     field, others, solution = turbulent
     off, error = field.off(solution)
@@ -48,6 +49,7 @@ def test_it_says_what_it_found(turbulent):
     assert_allclose(solution.residuals["x"], field.table["x"])
 
 
+@pytest.mark.slow
 def test_what_it_found_is_in_distortion_wcs_and_file(turbulent, tmp_path):
     """The WCS is made of stock models; errors of new positions are read again as they were."""
     _, _, solution = turbulent

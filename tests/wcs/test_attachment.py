@@ -124,7 +124,7 @@ def wcs_in(path, number=1):
         pytest.param(3, 20, {"lat": 89.9, "lon": 123.0}, marks=pytest.mark.slow),
         pytest.param(3, 100, {"lon": 0.0}, marks=pytest.mark.slow),
         pytest.param(5, 5, {"lat": -89.9, "parity": 1}, marks=pytest.mark.slow),
-        (5, 20, {"lon": 0.0, "turn": 170.0}),
+        pytest.param(5, 20, {"lon": 0.0, "turn": 170.0}, marks=pytest.mark.slow),
         (5, 100, {"lat": -60.0, "parity": 1}),
     ],
 )
@@ -922,7 +922,7 @@ def check_nothing_happened(solution, paths, folder, before):
     assert everything(folder).keys() == before.keys()
 
 
-@pytest.mark.parametrize("good", [0, pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.parametrize("good", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 def test_frames_are_changed_all_or_none(three, tmp_path, monkeypatch, good):
     solution, paths = three
     before, usual, written = everything(tmp_path), attachment._Plan.write, []
@@ -957,6 +957,7 @@ def test_a_disk_that_fails_between_two_files(three, tmp_path, monkeypatch):
     check_nothing_happened(solution, paths, tmp_path, before)
 
 
+@pytest.mark.slow
 def test_copies_come_together_beside_other_files(three, tmp_path, monkeypatch):
     """Of a folder of the user's own everything else stays, and a failure changes nothing."""
     solution, paths = three

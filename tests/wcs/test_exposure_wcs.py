@@ -328,6 +328,7 @@ def evaluate(wcs, seed):
     return np.array([*reference, *wcs.get_transform("reference", "detector")(*reference), *wcs(*p)])
 
 
+@pytest.mark.slow
 def test_eight_threads_agree(solution):
     wcs = solution[solution.names[1]].wcs
     expected = [evaluate(wcs, seed) for seed in range(4)]

@@ -115,6 +115,7 @@ def test_data_models_of_jwst(night, tmp_path):
     assert len(path.read_bytes()) == len(again)
 
 
+@pytest.mark.slow
 def test_a_file_of_the_archive_after_tweakreg(shared_data, tmp_path, caplog):
     path = tmp_path / "jw.fits"
     content = (shared_data / "jwst_nrcalong" / "jw01227_nrcalong_f444w_cutout.fits").read_bytes()
@@ -147,6 +148,7 @@ def test_a_file_of_the_archive_after_tweakreg(shared_data, tmp_path, caplog):
     assert np.abs(off).max() < 0.02
 
 
+@pytest.mark.slow
 def test_by_how_much_corners_move_is_said_once(night, tmp_path, caplog):
     paths, solution = night
     with caplog.at_level("INFO", "legdistort"):
