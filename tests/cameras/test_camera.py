@@ -474,6 +474,7 @@ class TestFittedCamera:
     def _here(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
 
+    @pytest.mark.slow
     def test_detectors_that_share_no_star(self, gsaoi):
         """Without dithers over the gap, and without rolls, nothing tells how the detectors lie: a warning says so."""
         rows = gsaoi_images.Night(n_exposures=6, turn=0.0).table(sigma=SIGMA)

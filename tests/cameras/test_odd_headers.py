@@ -96,7 +96,7 @@ def test_a_layout_that_is_not_known_contradicts_nothing():
     assert ld.Camera.gsaoi().headers is None
 
 
-@pytest.mark.parametrize(("n_x", "n_y"), [(3, 1), (2, 2), (3, 3)])
+@pytest.mark.parametrize(("n_x", "n_y"), [(3, 1), (2, 2), pytest.param(3, 3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("n_sets", [15, pytest.param(150, marks=pytest.mark.slow)])
 def test_headers_that_are_all_alike_wrong_have_no_odd_one(n_x, n_y, n_sets):
     rng = np.random.default_rng(2)
@@ -216,6 +216,7 @@ def test_a_star_or_two_show_it(seed, odd):
     assert ("--layout hold" not in found.cure) == any(odd)
 
 
+@pytest.mark.slow
 def test_static_distortions_cannot_make_up_for_it(matches, monkeypatch):
     """Where they fold in the attempt, it is said what they could not make up for."""
     in_camera, calls = camera_fit.in_camera, []

@@ -757,6 +757,7 @@ def test_the_ending_of_a_mosaic_is_looked_at_first(demo, tmp_path, capsys, monke
     failed(capsys, main(_coadd(demo, tmp_path / "m.png")), "m.png: the ending selects the format of a mosaic")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_keck_lists_by_the_command_line(shared_data, tmp_path, capsys):
     lists = [str(shared_data / "keck_nirc2_onc_bn" / f"{letter}.lis") for letter in "ABCD"]
@@ -812,7 +813,11 @@ def test_steps_keep_the_sky_as_run_finds_it(whole, steps, tmp_path, capsys, monk
 
 @pytest.mark.parametrize(
     ("kind", "files"),
-    [("keck-lists", "*.lis"), ("hst-lists", "*.xymq"), pytest.param("gwcs", "*.asdf", marks=pytest.mark.slow)],
+    [
+        pytest.param("keck-lists", "*.lis", marks=pytest.mark.slow),
+        ("hst-lists", "*.xymq"),
+        pytest.param("gwcs", "*.asdf", marks=pytest.mark.slow),
+    ],
 )
 def test_example_files_are_read_and_stay_the_same(kind, files, tmp_path, capsys):
     assert main(["demo", "--as", kind, "--out", str(tmp_path / "a")]) == 0
@@ -892,7 +897,11 @@ def test_widths_go_with_the_prior_of_headers(night, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("terminal", "more", "shown"),
-    [(True, [], True), pytest.param(True, ["--quiet"], False, marks=pytest.mark.slow), (False, [], False)],
+    [
+        (True, [], True),
+        pytest.param(True, ["--quiet"], False, marks=pytest.mark.slow),
+        pytest.param(False, [], False, marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.usefixtures("undrawn")
 def test_writing_shows_a_bar_on_a_terminal(terminal, more, shown, demo, tmp_path, capsys, monkeypatch):

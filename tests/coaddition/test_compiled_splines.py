@@ -42,7 +42,7 @@ def test_gain_is_a_product_of_polynomials():
     [
         pytest.param({"order": 1}, marks=pytest.mark.slow),
         {"order": 3},
-        {"order": 3, "weights": "variance"},
+        pytest.param({"order": 3, "weights": "variance"}, marks=pytest.mark.slow),
         pytest.param({"order": 2}, marks=pytest.mark.slow),
     ],
 )

@@ -142,6 +142,7 @@ class TestFluxScale:
         ):
             CoaddOptions(scale="sky")
 
+    @pytest.mark.slow
     def test_mosaic_through_clouds(self):
         solution, stars, flux, exposures, _ = plain()
         depth = [1.0, 0.6, 0.8, 1.2]
@@ -402,7 +403,15 @@ def _turned(solution, scale, angle=0.3):
 
 
 @pytest.mark.parametrize("scale", [None, *(pytest.param(each, marks=pytest.mark.slow) for each in (0.5, 2))])
-@pytest.mark.parametrize("settings", [{"order": 1}, {"order": 3}, {"algorithm": "drizzle"}, {"algorithm": "adaptive"}])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"order": 1},
+        {"order": 3},
+        pytest.param({"algorithm": "drizzle"}, marks=pytest.mark.slow),
+        pytest.param({"algorithm": "adaptive"}, marks=pytest.mark.slow),
+    ],
+)
 def test_noise_of_sums(settings, scale):
     """NOISECOR is the noise of the sum over a box over what VAR says, whatever the size of the pixels."""
     if settings.get("algorithm") == "drizzle":

@@ -111,6 +111,7 @@ class TestReferencePlane:
         matched = coadd(flat, solution)
         np.testing.assert_allclose(matched.data[seen], 7, rtol=1e-6)  # the sky stays flat
 
+    @pytest.mark.slow
     def test_total_flux_is_the_sum_over_the_detector(self):
         solution, *_ = plain()
         name = "frame0"
@@ -264,6 +265,7 @@ class TestCombination:
         chosen = covered(mean, xy)
         check_stars(clean, xy, flux, position=0.05, relative=0.03, chosen=chosen)
 
+    @pytest.mark.slow
     def test_clipping_spares_stars_of_different_sharpness(self):
         solution, stars, flux = scene(peak=5.0)
         exposures = expose(solution, stars, flux)
@@ -410,7 +412,7 @@ class TestFile:
     @pytest.mark.parametrize(
         "planes",
         [
-            (),
+            pytest.param((), marks=pytest.mark.slow),
             ("UNCERT", "MASK"),
             pytest.param(["CONTEXT"], marks=pytest.mark.slow),
             pytest.param("WEIGHT", marks=pytest.mark.slow),
@@ -496,6 +498,7 @@ class TestFile:
         header["BUNIT"] = unit
         assert replace(mosaic, header=header).to_ccddata().unit == u.dimensionless_unscaled
 
+    @pytest.mark.slow
     def test_times_of_the_exposures(self, tmp_path):
         solution, *_, exposures, _ = plain()
         clocks = [("DATE-OBS", "2024-03-01"), ("TIME-OBS", "22:00:00.5")], [("MJD-OBS", 60371.0)]

@@ -202,6 +202,7 @@ def test_solutions_with_tables_in_files(solution, tmp_path):
         Solution.read(tmp_path / "s.asdf")
 
 
+@pytest.mark.slow
 def test_wcs_files_with_tables_are_of_stock_models(solution, tmp_path):
     view, p = solution["exp00"], places(beyond=-1.0)
     path = write_wcs(view, tmp_path / "w.asdf")

@@ -397,6 +397,7 @@ def reads_or_refuses(path):
 # --- in the shell --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_from_lists_to_stars_in_the_shell(tmp_path, capsys):
     """LDAC lists without any option, solved, their checksums in the solution, its stars as FITS."""

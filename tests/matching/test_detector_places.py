@@ -44,7 +44,9 @@ def test_few_stars_that_cross_tie_detectors(seed, few):
     assert np.unique(true[rest], return_counts=True)[1].min() == 4
 
 
-@pytest.mark.parametrize("fluxes", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.parametrize(
+    "fluxes", [pytest.param(True, marks=pytest.mark.slow), pytest.param(False, marks=pytest.mark.slow)]
+)
 def test_chance_ties_no_detectors(fluxes):
     night = header_layouts.Night(7, off=3.0, dither=9.0, n=5, n_stars=800, odd=(22.0, -24.0, 0.6))
     assert not night.crossing(1)

@@ -109,6 +109,7 @@ def test_few_stars_half_of_them_missing_or_false():
     assert_good(table, match(table, shape=SHAPE), recall=0.9, purity=0.97)
 
 
+@pytest.mark.slow
 def test_without_fluxes():
     table = make_field(120, *six_poses(30, 300), seed=5)
     table.remove_column("flux")
@@ -118,6 +119,7 @@ def test_without_fluxes():
     assert np.all(np.diff(x) >= 0)
 
 
+@pytest.mark.slow
 def test_stars_of_few_pointings_are_joined_where_pointings_are_repeated():
     """Eight lists of each of five pointings: the exposures nearest to one are those of its own pointing."""
     rng = np.random.default_rng(5)
@@ -139,6 +141,7 @@ def test_stars_of_few_pointings_are_joined_where_pointings_are_repeated():
     assert (np.bincount(pairs[:, 1]) == 1).all()
 
 
+@pytest.mark.slow
 def test_large_offsets_and_scale():
     shifts = np.array([[0, 0], [1200, 0], [0, 1200], [600, 600], [1200, 1200], [300, -100]])
     table = make_field(300, [0, 0.3, 10, 0, 0, -20], shifts, seed=2)
@@ -153,7 +156,10 @@ def test_large_offsets_and_scale():
 
 @pytest.mark.parametrize(
     "angles",
-    [pytest.param([0, 90, 180, 270, 0, 90], marks=pytest.mark.slow), [10, 10, -120, 77, 5, 200]],
+    [
+        pytest.param([0, 90, 180, 270, 0, 90], marks=pytest.mark.slow),
+        pytest.param([10, 10, -120, 77, 5, 200], marks=pytest.mark.slow),
+    ],
     ids=["rolls", "any"],
 )
 def test_flips(angles):
@@ -206,6 +212,7 @@ def test_unrelated_lists_do_not_match():
             assert register(*lists) is None
 
 
+@pytest.mark.slow
 def test_two_groups():
     one = make_field(60, *six_poses(0.5, 100), seed=1)
     other = make_field(60, *six_poses(0.5, 100), seed=2)

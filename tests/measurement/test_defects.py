@@ -145,6 +145,7 @@ def test_hot_pixels_are_in_the_table_with_their_flag():
     assert np.all(np.diff(table["flux"]) <= 0)
 
 
+@pytest.mark.slow
 def test_a_star_is_measured_beside_the_defects_on_it():
     """What is hit of it is left out: errors stay true."""
     pulls = []
@@ -222,6 +223,7 @@ def test_stars_stay_where_the_sky_does_not_move():
     assert len(usable(table)) > 3 * 45
 
 
+@pytest.mark.slow
 def test_a_mask_that_hides_most_stars_is_named():
     """Of all stars or of most; one of hot pixels hides none."""
     (exposure,), _ = night(frames=1)

@@ -120,7 +120,9 @@ def test_variance_is_that_of_the_sky_in_a_crowded_field_with_halos():
     assert np.median(unknown.variance / expected) == pytest.approx(1, abs=0.25)
 
 
-@pytest.mark.parametrize("fwhm", [1.4, pytest.param(8.0, marks=pytest.mark.slow), 14.0])
+@pytest.mark.parametrize(
+    "fwhm", [1.4, pytest.param(8.0, marks=pytest.mark.slow), pytest.param(14.0, marks=pytest.mark.slow)]
+)
 def test_narrow_and_wide_stars_are_found_once(fwhm):
     rng = np.random.default_rng(8)
     size = 700 if fwhm > 5 else 300

@@ -448,6 +448,7 @@ def test_one_definition_of_the_centre_for_all_exposures():
     assert set(table["psf"]) == {"effective"}
 
 
+@pytest.mark.slow
 def test_too_few_stars_are_measured_with_moffat_profiles_by_name():
     lonely = moffat_exposure(9)
     with pytest.warns(AssumptionWarning, match=r"which needs 12: moffats has [0-9]+; measured with Moffat profiles"):
@@ -670,6 +671,7 @@ def test_picture(psf):
     assert len(plot_psf(psf.named(residual=None), fig=Figure(layout="constrained"))[1]) == 1 + 9
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_the_report_shows_the_psf(psf):
     from legdistort.reporting.page import render

@@ -53,6 +53,7 @@ def test_faint_stars_on_halos_have_true_errors(crowd):
         assert 1.4826 * np.median(np.abs(pulls[rows])) == pytest.approx(1, abs=0.15)
 
 
+@pytest.mark.slow
 def test_errors_grow_with_the_photons_of_the_halo():
     """Stars of one flux on and off a halo: the errors are in the ratio of the noise of the pixels."""
     rng = np.random.default_rng(22)

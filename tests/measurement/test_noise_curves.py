@@ -178,7 +178,7 @@ def test_light_put_in_is_what_was_asked():
     np.testing.assert_allclose(noisy.uncertainty**2, 9 + 0.5 * clean.data, rtol=1e-5)
 
 
-@pytest.mark.parametrize("errors", ["injected", "scaled"])
+@pytest.mark.parametrize("errors", ["injected", pytest.param("scaled", marks=pytest.mark.slow)])
 def test_errors_by_the_curve_are_true(grid, curves, errors):
     exposure, xy = grid
     plain = ld.measure(exposure)

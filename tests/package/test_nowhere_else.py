@@ -415,6 +415,7 @@ def test_asdf(alone, tmp_path, kind, root):
             assert "has no business in such a file" in text
 
 
+@pytest.mark.slow
 def test_images_of_roman_go_nowhere(alone, tmp_path):
     path = tmp_path / "r001_cal.asdf"
     image = {"data": np.ones((8, 9), np.float32), "meta": {"exposure": {"exposure_time": 1.0, "start_time": FAR}}}

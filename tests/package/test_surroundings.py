@@ -61,7 +61,7 @@ def whole(out):
 @pytest.mark.parametrize(
     ("locale", "name"),
     [
-        ("C", "with spaces, ünï ☆ 解"),
+        pytest.param("C", "with spaces, ünï ☆ 解", marks=pytest.mark.slow),
         pytest.param("POSIX", "with spaces", marks=pytest.mark.slow),
         pytest.param("C.UTF-8", "plain", marks=pytest.mark.slow),
     ],
@@ -201,6 +201,7 @@ def test_readers_need_no_permission_to_write(place, solution):
     assert [path.name for path in place.iterdir()] == ["solution.asdf"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_results_that_were_set_aside_are_brought_back_by_the_next_run(table, tmp_path, capsys):
     """Where a process was killed between two renames; they are replaced only if that is asked for."""

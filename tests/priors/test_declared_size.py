@@ -240,6 +240,7 @@ def test_prediction_without_a_prior_is_relative_and_says_so(more):
         assert "no scatter of single exposures was assumed" in str(exact.solution.gauge)
 
 
+@pytest.mark.slow
 def test_predict_command(capsys):
     command = ["predict", "--n-exposures", "8", "--n-stars", "50", "--sigma", "0.02", "--dynamic", "0.3", "--json"]
     assert main([*command, "--quiet"]) == 0

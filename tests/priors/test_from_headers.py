@@ -266,6 +266,7 @@ def test_commands_one_after_the_other_say_it(tmp_path, sip_night, capsys):
     assert state_of(ld.Solution.read(tmp_path / "out" / "solution.asdf")) == "warn"
 
 
+@pytest.mark.slow
 def test_the_sky_is_that_of_the_headers():
     """With their distortion as prior, stars are where the headers say, reference pixel off the centre or not."""
     table, sky = positions()

@@ -355,6 +355,7 @@ def test_nothing_is_left_behind_when_it_fails(tmp_path, solution, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_solved_set_gives_a_page(tmp_path):
     matches = observations.simulate_matches(n_stars=25, n_exposures=3, degree=2, seed=3).matches
     solution = solve(matches, degree=2)

@@ -147,7 +147,9 @@ SOME_OR_MANY = pytest.mark.parametrize(
 
 
 @SOME_OR_MANY
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(each, marks=[pytest.mark.slow] * (each in ("tied", "camera"))) for each in KINDS]
+)
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.LegdistortWarning")  # these sets tell little
 def test_solutions(kind, n, tmp_path, monkeypatch):
     path = KINDS[kind]().write(tmp_path / "s.asdf")

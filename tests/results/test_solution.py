@@ -248,7 +248,12 @@ def assert_survives(solution, remake):
 
 
 @pytest.mark.parametrize(
-    "remake", [lambda s: pickle.loads(pickle.dumps(s)), pytest.param(copy.copy, marks=pytest.mark.slow), copy.deepcopy]
+    "remake",
+    [
+        lambda s: pickle.loads(pickle.dumps(s)),
+        pytest.param(copy.copy, marks=pytest.mark.slow),
+        pytest.param(copy.deepcopy, marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.parametrize("what", ["motions", pytest.param("model", marks=pytest.mark.slow)])
 def test_copies(what, remake):

@@ -124,6 +124,7 @@ def test_what_residuals_determine_is_left_to_them(monkeypatch, method):
     assert b == pytest.approx(bound, rel=0.25)
 
 
+@pytest.mark.slow
 def test_understated_errors_do_not_contradict_the_convention():
     """At the observed scale the convention stands, whatever the stated errors claim."""
     sim = simulate_matches(seed=2, sigma=0.1, dither=250.0, n_stars=60)
@@ -270,6 +271,7 @@ def test_mismatched_exposure_is_named_and_moves_nobody(known_poses):
     assert np.all(np.abs(solution.coefficients - clean.coefficients) < error)
 
 
+@pytest.mark.slow
 def test_one_noisy_exposure_does_not_blur_the_others():
     """One of ten exposures with 100 x the errors costs what its data are worth, not more than 10 % beyond."""
     b, b_without = [], []

@@ -131,15 +131,18 @@ class TestEach:
             ):
                 list(results)
 
+    @pytest.mark.slow
     def test_a_worker_of_another_version_is_told(self, client, monkeypatch):
         monkeypatch.setattr(parallel, "version", lambda name: "0.0.1")
         with pytest.raises(LegdistortError, match=r"have legdistort [\d.]+, here it is 0\.0\.1: install the same"):
             list(map_items(abs, [1]))
 
+    @pytest.mark.slow
     def test_errors_of_the_work_come_as_they_are_from_a_cluster(self, client):
         with pytest.raises(FileNotFoundError, match="nowhere"):
             list(map_items(open, ["/nowhere"]))
 
+    @pytest.mark.slow
     def test_the_client_of_the_caller_is_used(self, client):
         assert set(map_items(_process, range(8))) == set(client.run(os.getpid).values())
         assert set(map_items(_process, range(8), workers=1)) == {os.getpid()}

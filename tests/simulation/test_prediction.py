@@ -247,6 +247,7 @@ def test_rules_of_thumb():
         assert (p.s_b, p.s_sigma) == pytest.approx(p.thumb, rel=0.03)
 
 
+@pytest.mark.slow
 def test_the_figures_of_simulation_1():
     """Paper, section 4.1: b = 0.05 px, sigma = 0.16 px; rms over ten fields."""
     b, sigma = np.transpose([(p.b, p.sigma) for p in (predict(n_exposures=10, n_stars=30, sigma=0.14, seed=seed)
@@ -448,6 +449,7 @@ def test_relative_errors_do_not_depend_on_what_is_known_of_the_common_map():
     assert all_of_it.b_abs > 1.5 * exact.b_abs
 
 
+@pytest.mark.slow
 def test_a_degree_higher_than_that_of_the_widths_of_a_prior():
     prior = Prior(np.zeros((2, 21)), sigma=0.3, static_sigma=0.01)
     table = predict(n_exposures=11, n_stars=80, sigma=0.02, prior=prior).alternatives()

@@ -226,6 +226,7 @@ def test_sizes_that_are_none_are_said():
         ld.predict(**GOOD | {"n_stars": 3000}, terms=FIELD)
 
 
+@pytest.mark.slow
 def test_command(capsys):
     asked = ["predict", "--n-exposures", "4", "--n-stars", "30", "--sigma", "0.02", "--degree", "1", "--term"]
     assert main([*asked, "turbulence=0.1:300:1.5:2:30"]) == 0

@@ -117,6 +117,7 @@ def test_coma_and_astigmatism_grow_off_axis():
     np.testing.assert_allclose(field, fixed, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_exposures_differ_and_a_seed_repeats_them():
     psf = PupilPSF(strehl=0.14, jitter=1.2, elongation=0.5, coma=0.2)
     drawn = [psf.varied(np.random.default_rng(seed)) for seed in range(15)]

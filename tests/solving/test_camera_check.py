@@ -64,6 +64,7 @@ def test_what_no_dither_tests_is_said_to_be_believed():
     assert check.cure.startswith("dithers larger than the gaps")
 
 
+@pytest.mark.slow
 def test_widths_that_are_stated_are_tested():
     matches = four_detectors.matches(None, 0)
     check = check_of(stated(matches, 1.0, 0))

@@ -124,6 +124,7 @@ def test_stars_of_the_catalogue_have_what_it_knows_of_them():
     assert np.median(ratio) == pytest.approx(1, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_tie_settles_where_the_scatter_of_motions_is_known():
     """The map of the positions is not mixed with those that change with time, which the motions of stars then tell."""
     sim = field(60)
@@ -151,6 +152,7 @@ def test_a_table_of_stars_is_a_prior_of_its_motions():
         solve(sim.matches, motion="proper", reference=stars)
 
 
+@pytest.mark.slow
 def test_positions_alone_and_parallaxes_alone():
     """What the catalogue does not tell stays as it is: motions without rates, parallaxes without their mean."""
     sim = field(60, FIVE, parallax=0.1)

@@ -110,6 +110,7 @@ def test_times_tell_what_the_order_of_the_exposures_does_not():
     assert lost.along != "time" or lost.length < found.length * 480 / 2
 
 
+@pytest.mark.slow
 def test_errors_along_the_detector_are_found():
     matches, _ = drifting(0, seed=3)
     table = matches.table.copy()
@@ -123,7 +124,7 @@ def test_errors_along_the_detector_are_found():
     assert 1 < found.length < 15
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_where_there_is_nothing_the_errors_are_those_of_a_floor(seed):
     matches, _ = drifting(0, seed, n_exposures=12)
     floored, solution = solved(matches, "floor"), solved(matches)

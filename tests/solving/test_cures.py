@@ -67,6 +67,7 @@ def assert_foretold(size, seed):
     return found[2]
 
 
+@pytest.mark.slow
 def test_what_a_degree_leaves_of_turbulence_is_foretold():
     assert assert_foretold(0.8, 206) is None
 

@@ -77,6 +77,7 @@ def test_the_choice_is_seeded():
     assert not np.array_equal(first, other)
 
 
+@pytest.mark.slow
 def test_scatter_is_what_the_errors_say():
     """Means over seeds; unequal errors, dithers, and a prior with widths."""
     rng = np.random.default_rng(0)
@@ -490,6 +491,7 @@ def test_run_refuses_before_it_reads(tmp_path):
         run(tmp_path / "no.fits", out=tmp_path / "out", solving={"validate": 2})
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_command_line(tmp_path, capsys):
     sim = simulate(30, 0.5, 0.5, n_exposures=5)

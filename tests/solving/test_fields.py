@@ -118,6 +118,7 @@ def test_with_nothing_in_common_each_is_as_by_itself():
             assert_allclose(columns_of(both, kind)[mine], columns_of(alone, kind), rtol=0.01)
 
 
+@pytest.mark.slow
 def test_a_rolled_field_tells_the_shear_of_another():
     """Without rolls shears of the sky and of the detector are alike, unless another field tells the latter."""
     data, truth = field_sets.drawn_fields(1, dynamic=0.1)
@@ -226,6 +227,7 @@ def test_a_field_of_one_date_beside_one_in_which_stars_move(motion):
     assert not np.isfinite(rates[~mine]).any()
 
 
+@pytest.mark.slow
 def test_the_layout_of_a_camera_is_found_from_all_fields():
     parts, truth = {}, {}
     for k, label in enumerate("ab"):
@@ -254,6 +256,7 @@ def test_the_layout_of_a_camera_is_found_from_all_fields():
     assert rms[0] < 0.85 * rms[1]
 
 
+@pytest.mark.slow
 def test_fields_are_joined_by_name():
     data, truth = field_sets.drawn_fields(8, dynamic=0.3)
     parts = {name: drawn_sets.as_matches(only(data, truth, k)[0]) for k, name in enumerate(("M15", "M92"))}

@@ -87,6 +87,7 @@ def bent():
     return legdistort.match(night.table, exposures=night.exposures)
 
 
+@pytest.mark.slow
 def test_what_nothing_determines_stays_as_headers_have_it(bent):
     """Detectors with distortions of their own are not turned for a map which exposures and detectors exchange."""
     solution = legdistort.solve(bent, degree=2, static="fit")
@@ -113,6 +114,7 @@ def test_what_is_known_little_of_poses_and_layouts_leads_nowhere_astray(bent, de
     assert np.abs(solution.camera.headers.shifts).max() < 1.0
 
 
+@pytest.mark.slow
 def test_detectors_together_keep_the_scale_of_headers(bent):
     """However little is stated of them: what all have in common poses take up, and the stars tell nothing of it."""
     solution = legdistort.solve(bent, degree=2, static="fit", layout_sigma={"shift": 20.0, "rotation": 0.5})
@@ -121,7 +123,9 @@ def test_detectors_together_keep_the_scale_of_headers(bent):
     assert solution.chi2 == pytest.approx(solution.dof, rel=0.1)
 
 
-@pytest.mark.parametrize("name", [pytest.param("pose_sigma", marks=pytest.mark.slow), "layout_sigma"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("pose_sigma", marks=pytest.mark.slow), pytest.param("layout_sigma", marks=pytest.mark.slow)]
+)
 def test_the_check_of_absolute_positions_names_what_cures_it(near, name):
     """Where headers may tell what stars do not; and with it the check passes."""
     before, after = (

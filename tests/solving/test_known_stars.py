@@ -85,7 +85,9 @@ def test_relative_errors_are_those_of_measurement_and_solution():
     assert np.sqrt(np.mean(off[~known] ** 2)) == pytest.approx(0.02, rel=0.4)
 
 
-@pytest.mark.parametrize("with_sky", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize(
+    "with_sky", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.slow)]
+)
 def test_files_and_planes_that_are_turned(tmp_path, with_sky):
     """The plane of the solution is the one of its first exposure, that of the other its own: found by the pattern."""
     matches, last, *_ = field(1, rolls=75.0)

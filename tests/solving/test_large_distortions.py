@@ -77,7 +77,9 @@ ROWS = {
 }
 
 
-@pytest.mark.parametrize("row", ROWS)
+@pytest.mark.parametrize(
+    "row", [pytest.param(row, marks=[pytest.mark.slow] * (k > 1)) for k, row in enumerate(reversed(ROWS))]
+)
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))])
 def test_large_distortions_cost_no_chi2(row, seed):
     """Where a convention holds the plane it is 80 and 270 times its degrees of freedom in the first two rows."""
@@ -190,7 +192,7 @@ def test_errors_have_those_of_what_is_common_beyond_the_degree(sets):
         assert true / stated == pytest.approx(1, abs=0.25 if sets > 5 else 0.35), name
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [pytest.param(1, marks=pytest.mark.slow), pytest.param(10, marks=pytest.mark.slow)])
 def test_a_misfit_is_enough_to_look_beyond_the_degree(seed):
     """Departures are too small to count in second order; chi2 is 20 times its degrees of freedom without."""
     data, _ = dense_model.drawn_set(seed, **ROWS["terms beyond the degree"][0] | {"higher": 0.05})

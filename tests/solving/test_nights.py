@@ -149,6 +149,7 @@ def test_two_turned_nights_tell_how_far_they_scatter(seed):
     assert "too few nights" not in str(solution.gauge)
 
 
+@pytest.mark.slow
 def test_a_right_prior_is_right_whatever_nights_add():
     """Were exposures independent, those of four nights would contradict it, by chance of 1e-15."""
     nights = Nights(2, nights=4, nightly=0.3, roll=30.0)
@@ -163,7 +164,9 @@ def test_a_right_prior_is_right_whatever_nights_add():
     assert states["nights"].value > 1e-3 > states["one"].value
 
 
-@pytest.mark.parametrize(("odd", "named"), [(0.5, ["departure of night 4"]), (0.0, [])])
+@pytest.mark.parametrize(
+    ("odd", "named"), [(0.5, ["departure of night 4"]), pytest.param(0.0, [], marks=pytest.mark.slow)]
+)
 def test_an_odd_night_is_named(odd, named):
     solution = ld.solve(matches(Nights(5, per=3, odd=odd, roll=0.7, n_stars=100).table))
     found = [str(row["name"]) for row in solution.factors if str(row["name"]).startswith("departure")]
@@ -185,6 +188,7 @@ def beyond_similarity(tensor):
     return np.sqrt(np.mean(np.abs(w.ravel() - design @ np.linalg.lstsq(design, w.ravel(), rcond=None)[0]) ** 2))
 
 
+@pytest.mark.slow
 def test_the_odd_night_is_named_with_all_its_exposures(tmp_path):
     nights = Nights(5, odd=0.5, roll=0.7)
     solution = solved(nights)

@@ -198,6 +198,7 @@ def test_options_that_compare_exposures_are_refused(options, words):
         ld.solve(matches)
 
 
+@pytest.mark.slow
 def test_the_report_has_no_empty_pictures():
     """Expected residuals count what the catalogue knows of its stars, as those that are there do."""
     table, catalogue, _ = one_exposure(2)

@@ -213,6 +213,7 @@ def test_order_of_exposures_does_not_matter():
     assert_allclose(solve(turned, prior=prior).diagnostics.widths, found(sim).diagnostics.widths, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_errors_known_up_to_a_factor():
     """Errors stated twice too small: with errors="scale" the widths are what they were."""
     sim = simulate(15)
@@ -417,7 +418,11 @@ def test_a_plan_needs_numbers():
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
-    "arguments", [pytest.param(["--prior-sigma", "evidence"], marks=pytest.mark.slow), ["--prior-sigma", "0.9"]]
+    "arguments",
+    [
+        pytest.param(["--prior-sigma", "evidence"], marks=pytest.mark.slow),
+        pytest.param(["--prior-sigma", "0.9"], marks=pytest.mark.slow),
+    ],
 )
 def test_command_line(arguments, tmp_path, capsys):
     sim = simulate(7)

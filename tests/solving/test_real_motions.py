@@ -56,6 +56,7 @@ def names(solution):
     return np.array([max(set(found[star]), key=found[star].count) for star in solution.estimate.star_names])
 
 
+@pytest.mark.slow
 def test_motions_explain_what_positions_do_not(epochs, moving):
     still = solve(epochs, degree=2)
     assert moving.settings.motion == "proper"

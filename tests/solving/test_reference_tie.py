@@ -288,7 +288,14 @@ def test_mismatched_stars_are_rejected_by_name(sim):
     assert np.mean(pulls(sim, solution) ** 2) == pytest.approx(1, abs=0.4)
 
 
-@pytest.mark.parametrize(("rounds", "words"), [(3, "may be off by as much"), (4, "too little to matter"), (10, None)])
+@pytest.mark.parametrize(
+    ("rounds", "words"),
+    [
+        pytest.param(3, "may be off by as much", marks=pytest.mark.slow),
+        (4, "too little to matter"),
+        pytest.param(10, None, marks=pytest.mark.slow),
+    ],
+)
 def test_a_tie_that_does_not_settle_says_how_far_it_is(monkeypatch, caplog, rounds, words):
     """A static distortion of 12 px, unknown: the plane moves by 9, 0.8, 0.08 and 0.004 px; its error is 0.03 px."""
     sim = simulate(static=12.0)

@@ -85,6 +85,7 @@ def test_it_is_what_it_says(drawn, gsaoi, tmp_path):
     assert np.array_equal(again["frame03-2"].correct(xy), solution["frame03-2"].correct(xy))
 
 
+@pytest.mark.slow
 def test_one_detector_is_as_without_camera(gsaoi):
     """The layout of a single detector is in the poses: the positions are those of the same prior without a camera."""
     table = gsaoi_images.Night(n_exposures=5, n_stars=250).table(sigma=SIGMA)

@@ -134,7 +134,7 @@ def test_score_of_cells_is_the_chi2_that_a_dense_fit_gains():
     [
         ({"dither": 0.5}, "unknown"),
         pytest.param({}, "pass", marks=pytest.mark.slow),
-        ({"rolls": 30.0, "dither": 0.0}, "pass"),
+        pytest.param({"rolls": 30.0, "dither": 0.0}, "pass", marks=pytest.mark.slow),
     ],
 )
 def test_what_stars_would_hide_is_not_said_to_be_absent(taken, state):

@@ -350,6 +350,7 @@ def test_a_parallax_needs_the_sky():
         solve(field(40, sky=None).matches, motion="parallax")
 
 
+@pytest.mark.slow
 def test_a_parallax_in_one_season_is_told():
     with pytest.warns(AssumptionWarning, match=r"hardly distinguish .* \(condition number \d+"):
         solve(field(40, np.repeat([2015.5, 2016.501, 2018.498], 4)).matches, motion="parallax")
@@ -457,7 +458,7 @@ def test_a_catalogue_ties_positions_at_the_epoch_of_the_motions():
     ("n", "accuracy", "sigma"),
     [
         pytest.param(4, 0.2, None, marks=pytest.mark.slow),
-        (2, 0.3, 0.3),
+        pytest.param(2, 0.3, 0.3, marks=pytest.mark.slow),
         pytest.param(60, 0.1, None, marks=pytest.mark.slow),
     ],
 )
@@ -508,6 +509,7 @@ def test_a_catalogue_without_motions_serves_stars_that_move_at_its_own_epoch_alo
     assert some.diagnostics.reference.n_stars == 25
 
 
+@pytest.mark.slow
 def test_motions_of_a_catalogue_that_disagree():
     sim = field(60)
     gaia = catalogue(sim, RNG)
@@ -519,7 +521,7 @@ def test_motions_of_a_catalogue_that_disagree():
     assert solve(sim.matches, motion="proper", reference=places).gauge.drift.n_tied == 0
 
 
-@pytest.mark.parametrize("sky", [pytest.param(None, marks=pytest.mark.slow), SKY])
+@pytest.mark.parametrize("sky", [pytest.param(None, marks=pytest.mark.slow), pytest.param(SKY, marks=pytest.mark.slow)])
 def test_pictures_of_motions(sky):
     solution = solve(field(60, sky=sky).matches, motion="proper")
     ax = motion_plots.plot_motions(solution)
@@ -543,6 +545,7 @@ def test_the_report_shows_motions(tmp_path):
     assert "relative to the mean of the stars" in page
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_the_report_shows_what_motions_are_tied_to(tmp_path):
     sim = field(60)

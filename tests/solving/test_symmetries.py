@@ -103,6 +103,10 @@ SETTINGS = {
 }
 
 
+#: One of each kind of estimation.
+QUICK = {"plain", "exact prior", "cauchy", "clipped", "motions", "reference", "static fitted", "scale"}
+
+
 def found(solution, names=None):
     """Positions, errors (n, 2) and the others (n, k) of the stars in the order of their numbers, and the solution."""
     stars = solution.stars
@@ -159,9 +163,9 @@ def solved():
 
 
 def cases(*without):
-    """Settings and seeds, of which those beyond the first are slow, and a degree that is chosen."""
+    """Settings and seeds, of which those beyond the first are slow, and what is much like another or takes long."""
     made = [(setting, seed) for setting in SETTINGS if setting not in without for seed in range(2)]
-    slow = [seed > 0 or setting == "degree chosen" for setting, seed in made]
+    slow = [seed > 0 or setting not in QUICK for setting, seed in made]
     return [pytest.param(*each, marks=[pytest.mark.slow] * s) for each, s in zip(made, slow, strict=True)]
 
 

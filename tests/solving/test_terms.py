@@ -44,6 +44,7 @@ def test_errors_hold_that_of_the_term():
     assert_allclose(with_term.dof, plain.dof - 1, atol=0.01)
 
 
+@pytest.mark.slow
 def test_pixel_phase_is_taken_off():
     """Waves of 0.03 px, by where a star falls on its pixel."""
     bent = sky(2, phase=0.03)
@@ -81,7 +82,10 @@ def test_a_term_takes_itself_away():
 
 @pytest.mark.parametrize(
     ("term", "bent"),
-    [("acceleration", {"acceleration": 0.02}), pytest.param("orbits", {"orbits": 3.0}, marks=pytest.mark.slow)],
+    [
+        pytest.param("acceleration", {"acceleration": 0.02}, marks=pytest.mark.slow),
+        pytest.param("orbits", {"orbits": 3.0}, marks=pytest.mark.slow),
+    ],
 )
 def test_stars_on_orbits_are_kept(term, bent):
     """They are named, and no other; their places at any time, and all others, are right within their errors."""
@@ -137,6 +141,7 @@ def test_errors_are_scaled_with_the_others():
     assert_allclose(found.star_weights, stated.star_weights)
 
 
+@pytest.mark.slow
 def test_what_an_earlier_solution_took_off_is_there_again():
     field = sky(1, refraction=0.02)
     plain = field.solve()

@@ -125,7 +125,7 @@ def wcs_in(path, number=1):
         pytest.param(3, 100, {"lon": 0.0}, marks=pytest.mark.slow),
         pytest.param(5, 5, {"lat": -89.9, "parity": 1}, marks=pytest.mark.slow),
         pytest.param(5, 20, {"lon": 0.0, "turn": 170.0}, marks=pytest.mark.slow),
-        (5, 100, {"lat": -60.0, "parity": 1}),
+        pytest.param(5, 100, {"lat": -60.0, "parity": 1}, marks=pytest.mark.slow),
     ],
 )
 def test_every_form_gives_the_same_sky(geometry, tmp_path, degree, peak, place):
@@ -651,6 +651,7 @@ def test_one_image_under_two_names(geometry, mosaic):
 # --- refusals, with nothing written ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_nothing_is_written_unless_all_can_be(geometry, tmp_path):
     good = geometry(3, 2.0, shape=SHAPE, names=("frame", "other"))
     coefficients = good.coefficients.copy()
@@ -940,6 +941,7 @@ def test_frames_are_changed_all_or_none(three, tmp_path, monkeypatch, good):
     check_nothing_happened(solution, paths, tmp_path, before)
 
 
+@pytest.mark.slow
 def test_a_disk_that_fails_between_two_files(three, tmp_path, monkeypatch):
     """Those that were replaced come back, in whatever folder."""
     solution, paths = three

@@ -83,6 +83,7 @@ def test_asdf_files_of_roman(night, tmp_path):
     assert_allclose(read.wcs(3.0, 4.0), solution[name].wcs(3.0, 4.0), rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_data_models_of_jwst(night, tmp_path):
     asdf_in_fits = pytest.importorskip("stdatamodels.asdf_in_fits")
     paths, solution = night
