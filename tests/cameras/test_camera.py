@@ -519,6 +519,7 @@ class TestFittedCamera:
         assert "Detectors of camera GSAOI" in page
         assert f"{each[0].x:.4f} ± {each[0].errors[0]:.4f}" in page  # 0.0021
 
+    @pytest.mark.slow
     def test_the_next_night_knows_what_this_one_did_not(self, gsaoi):
         """A camera found without rolls leaves the common shear unknown, also where it is taken as known later."""
         night = gsaoi_images.Night(n_exposures=6, n_stars=350, dither=6.0, turn=0.0)

@@ -46,7 +46,7 @@ RESULTS = {path.split("/")[0] for path in pipeline.RESULTS} - {"psf", *pipeline.
 @pytest.fixture(scope="module")
 def night(tmp_path_factory):
     folder = tmp_path_factory.mktemp("night")
-    return simulate_exposures(small=True, seed=3).write(folder)
+    return simulate_exposures(small=True, size=320, n_stars=60, seed=3).write(folder)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def run(frames, out, *more):
 def whole(night, tmp_path_factory):
     """The night and a frame without stars run once in the place of other results: folder, what it printed, seconds."""
     folder = tmp_path_factory.mktemp("whole")
-    noise = fits.PrimaryHDU(np.random.default_rng(0).normal(400, 12, (512, 512)).astype("float32"))
+    noise = fits.PrimaryHDU(np.random.default_rng(0).normal(400, 12, (320, 320)).astype("float32"))
     noise.header["GAIN"], noise.header["RDNOISE"] = 2.0, 15.0
     noise.writeto(folder / "empty.fits")
     out = folder / "out"

@@ -83,7 +83,7 @@ def bad_files(folder):
 
 @pytest.fixture(scope="module")
 def night(tmp_path_factory):
-    return ld.simulate_exposures(small=True, seed=3).write(tmp_path_factory.mktemp("night"))
+    return ld.simulate_exposures(small=True, size=320, n_stars=60, seed=3).write(tmp_path_factory.mktemp("night"))
 
 
 def test_bad_files_are_left_out_together(tmp_path, night):

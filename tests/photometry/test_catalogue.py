@@ -302,7 +302,7 @@ def test_pixels_on_the_disk_give_the_same_catalogue(truth, solution, found, tmp_
 @pytest.mark.parametrize(
     "sides",
     [
-        {"_BLOCK": 61, "_SMALL": 37},
+        pytest.param({"_BLOCK": 61, "_SMALL": 37}, marks=pytest.mark.slow),
         pytest.param({"_WORTH": 0}, marks=pytest.mark.slow),
         pytest.param({"_AROUND": 6.0}, marks=pytest.mark.slow),
     ],

@@ -72,7 +72,7 @@ def test_the_dense_oracle_agrees(kind, epochs):
     ("n", "kind", "sigma", "accuracy"),
     [
         pytest.param(6, "proper", None, 0.2, marks=pytest.mark.slow),
-        (3, "parallax", None, 0.25),
+        pytest.param(3, "parallax", None, 0.25, marks=pytest.mark.slow),
         pytest.param(30, "proper", None, 0.1, marks=pytest.mark.slow),
         pytest.param(30, "proper", 0.3, 0.1, marks=pytest.mark.slow),
         pytest.param(30, "parallax", None, 0.1, marks=pytest.mark.slow),

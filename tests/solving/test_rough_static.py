@@ -38,6 +38,7 @@ def off(mask, solution, q, degree=2):
     return np.std(beyond(found - mask.map(q), q, mask.size, degree))
 
 
+@pytest.mark.slow
 def test_the_map_is_as_good_as_it_can_be(mask, solution):
     q = mask.at()
     optimum, chi2 = mask.optimum(q)
