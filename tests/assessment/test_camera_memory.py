@@ -147,15 +147,14 @@ def test_sizes_are_found(words, low, high):
     assert drifts == (2 if "rate" in words else 0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "low", "high"),
     [
-        ({"n": 20}, 0.8, 1.25),
-        ({"n": 40, "rate": 0.05}, 0.7, 1.25),
-        ({"n": 20, "odd": 5}, 0.6, 1.25),
-        ({"n": 2}, 0.6, 1.4),
-        ({"n": 3}, 0.6, 1.4),
+        pytest.param({"n": 20}, 0.8, 1.25, marks=pytest.mark.slow),
+        pytest.param({"n": 40, "rate": 0.05}, 0.7, 1.25, marks=pytest.mark.sets),
+        pytest.param({"n": 20, "odd": 5}, 0.6, 1.25, marks=pytest.mark.sets),
+        pytest.param({"n": 2}, 0.6, 1.4, marks=pytest.mark.sets),
+        pytest.param({"n": 3}, 0.6, 1.4, marks=pytest.mark.slow),
     ],
     ids=["constant", "drift", "odd", "two", "three"],
 )
@@ -437,9 +436,15 @@ def test_the_command(three, tmp_path, capsys):
     assert_allclose(found.static()[0], ld.combine_nights(three).static()[0], atol=1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    "words", [{"n": 6}, {"n": 6, "turns": (0, 40)}, {"n": 8, "rate": 0.05}, {"n": 6, "odd": 2}], ids=str
+    "words",
+    [
+        pytest.param({"n": 6}, marks=pytest.mark.sets),
+        pytest.param({"n": 6, "turns": (0, 40)}, marks=pytest.mark.sets),
+        pytest.param({"n": 8, "rate": 0.05}, marks=pytest.mark.slow),
+        pytest.param({"n": 6, "odd": 2}, marks=pytest.mark.slow),
+    ],
+    ids=str,
 )
 def test_a_campaign_is_calibrated(words):
     """Ten of each: squared errors of coefficients over their variance, at the last date, of what is determined."""

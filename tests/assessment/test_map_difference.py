@@ -409,8 +409,14 @@ def test_chances_are_even_where_nights_scatter():
     assert np.mean(chances["one"]) < 0.15
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("how", [{}, {"turns": (0,), "single": 0.03}, {"turns": (0, 180), "exposures": 8}])
+@pytest.mark.parametrize(
+    "how",
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        pytest.param({"turns": (0,), "single": 0.03}, marks=pytest.mark.sets),
+        pytest.param({"turns": (0, 180), "exposures": 8}, marks=pytest.mark.slow),
+    ],
+)
 def test_chances_are_even_and_five_sigma_are_found(how):
     """20 nights: p is anything, and a camera that is off by 5 sigma in a direction that is determined is found."""
     chances, found = [], 0

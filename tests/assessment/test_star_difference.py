@@ -157,7 +157,7 @@ def test_stars_are_compared_where_maps_cannot_be():
         found.plot()
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 def test_chances_of_stars_are_even():
     """Halves of eight nights, with motions: squares over those of the errors, and p, which is anything."""
     sets = (Nights(seed, n_stars=120, motion=0.05) for seed in range(8))

@@ -97,7 +97,7 @@ def test_a_layout_that_is_not_known_contradicts_nothing():
 
 
 @pytest.mark.parametrize(("n_x", "n_y"), [(3, 1), (2, 2), pytest.param(3, 3, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("n_sets", [15, pytest.param(150, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n_sets", [15, pytest.param(150, marks=pytest.mark.sets)])
 def test_headers_that_are_all_alike_wrong_have_no_odd_one(n_x, n_y, n_sets):
     rng = np.random.default_rng(2)
     odd = [camera(n_x, n_y, rng.normal(0, [5, 5, 0], (n_x * n_y, 3))).headers.odd for _ in range(n_sets)]

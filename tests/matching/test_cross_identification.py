@@ -55,7 +55,13 @@ def test_a_catalogue_of_other_stars_is_not_found(n_known):
     none_found(range(5), n_known=n_known)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("n_known", [15, 40, 100])
+@pytest.mark.parametrize(
+    "n_known",
+    [
+        pytest.param(15, marks=pytest.mark.sets),
+        pytest.param(40, marks=pytest.mark.slow),
+        pytest.param(100, marks=pytest.mark.sets),
+    ],
+)
 def test_a_catalogue_of_other_stars_is_never_found(n_known):
     none_found(range(100), n_known=n_known)

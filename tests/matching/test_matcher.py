@@ -66,8 +66,11 @@ def test_field(cell, flips, headers):
     assert_field(cell, seed=6, flips=flips, headers=headers)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("cell", CELLS, ids=str)
+@pytest.mark.parametrize(
+    "cell",
+    [pytest.param(cell, marks=pytest.mark.sets if k % 5 else pytest.mark.slow) for k, cell in enumerate(CELLS)],
+    ids=str,
+)
 def test_other_fields(cell):
     for seed in range(4):
         assert_field(cell, seed=seed)

@@ -248,10 +248,16 @@ def test_a_core_that_moffat_profiles_lack(monkeypatch):
     assert not (table["flags"][bright] & Flag.MASKED).any()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("strehl", "halo", "stars"),
-    [(0.05, 25.0, {}), (0.1, 10.0, {}), (0.6, 10.0, {}), (0.1, 40.0, {}), (0.6, 40.0, {}), (0.3, 25.0, {"n": 12})],
+    [
+        pytest.param(0.05, 25.0, {}, marks=pytest.mark.slow),
+        pytest.param(0.1, 10.0, {}, marks=pytest.mark.sets),
+        pytest.param(0.6, 10.0, {}, marks=pytest.mark.sets),
+        pytest.param(0.1, 40.0, {}, marks=pytest.mark.sets),
+        pytest.param(0.6, 40.0, {}, marks=pytest.mark.slow),
+        pytest.param(0.3, 25.0, {"n": 12}, marks=pytest.mark.slow),
+    ],
 )
 def test_extreme_strehl_ratios_and_halos(monkeypatch, strehl, halo, stars):
     """False stars, positions and errors at the limits: of Strehl ratios, halos, and stars that make a PSF."""

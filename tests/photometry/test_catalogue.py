@@ -566,7 +566,7 @@ def test_a_deep_field_with_hits_of_particles():
     assert np.count_nonzero(found.stars["flags"] & Flag.VARIABLE) <= 0.02 * len(found.stars)
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 def test_artificial_stars_tell_the_truth():
     """The part found of them is that found of true stars, and so is the excess of fluxes near the threshold."""
     true, artificial, bias = [], [], []

@@ -142,7 +142,7 @@ def check(path, read, use, monkeypatch, module, n):
 
 
 SOME_OR_MANY = pytest.mark.parametrize(
-    "n", [pytest.param(4, id="some"), pytest.param(30, id="many", marks=pytest.mark.slow)]
+    "n", [pytest.param(4, id="some"), pytest.param(30, id="many", marks=pytest.mark.sets)]
 )
 
 

@@ -405,9 +405,13 @@ def test_files_keep_what_is_needed(solution, tmp_path):
 # -- are they true?
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["prior, exact, 0.02 px", "prior, exact, 0.003 px", "prior with static_sigma, 0.02 px"]
+    "name",
+    [
+        pytest.param("prior, exact, 0.02 px", marks=pytest.mark.sets),
+        pytest.param("prior, exact, 0.003 px", marks=pytest.mark.slow),
+        pytest.param("prior with static_sigma, 0.02 px", marks=pytest.mark.sets),
+    ],
 )
 def test_errors_are_calibrated(name):
     """Truth of Chebyshev polynomials; relative after a cubic map, absolute after the similarity of the stars."""

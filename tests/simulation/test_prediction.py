@@ -60,19 +60,18 @@ def test_agrees_with_monte_carlo(n_im, n_star, n):
     assert_agrees(n_im, n_star, 0.14, n, tolerance=0.06, accuracy=0.025)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n_im", "n_star", "sigma", "n"),
     [
-        (10, 30, 0.14, 120),  # Simulation 1
-        (10, 30, 0.03, 120),  # Simulation 2, its smallest and largest noise
-        (10, 30, 0.28, 120),
-        (2, 30, 0.14, 200),  # Simulation 3
-        (50, 30, 0.14, 130),
-        (100, 30, 0.14, 130),
-        (10, 20, 0.14, 200),  # Simulation 4
-        (10, 100, 0.14, 60),
-        (10, 200, 0.14, 60),
+        pytest.param(10, 30, 0.14, 120, marks=pytest.mark.slow),  # Simulation 1
+        pytest.param(10, 30, 0.03, 120, marks=pytest.mark.sets),  # Simulation 2, its smallest and largest noise
+        pytest.param(10, 30, 0.28, 120, marks=pytest.mark.sets),
+        pytest.param(2, 30, 0.14, 200, marks=pytest.mark.slow),  # Simulation 3
+        pytest.param(50, 30, 0.14, 130, marks=pytest.mark.sets),
+        pytest.param(100, 30, 0.14, 130, marks=pytest.mark.sets),
+        pytest.param(10, 20, 0.14, 200, marks=pytest.mark.slow),  # Simulation 4
+        pytest.param(10, 100, 0.14, 60, marks=pytest.mark.sets),
+        pytest.param(10, 200, 0.14, 60, marks=pytest.mark.sets),
     ],
 )
 def test_simulations_of_the_paper(n_im, n_star, sigma, n):

@@ -266,8 +266,9 @@ def over_stated(prediction, solution):
     return ratios
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("rms", "width"), [(0.1, 50.0), (0.5, 10.0)])
+@pytest.mark.parametrize(
+    ("rms", "width"), [pytest.param(0.1, 50.0, marks=pytest.mark.slow), pytest.param(0.5, 10.0, marks=pytest.mark.sets)]
+)
 def test_turbulence_that_is_forecast_is_what_solve_states(rms, width):
     """Of screens by numpy; and the scatter of stars that took no part is the one forecast."""
     squares = []

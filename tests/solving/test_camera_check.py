@@ -122,8 +122,9 @@ def test_departures_of_right_widths_are_those_of_chance():
     assert chi2 / dof == pytest.approx(1, abs=4 * np.sqrt(2 / dof))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(1, 9))
+@pytest.mark.parametrize(
+    "seed", [pytest.param(seed, marks=pytest.mark.slow if seed < 3 else pytest.mark.sets) for seed in range(1, 9)]
+)
 def test_states_hold_for_other_sets(seed):
     assert check_of(four_detectors.matches(None, seed)).state == "pass"
     for kind, cure in four_detectors.CURES.items():

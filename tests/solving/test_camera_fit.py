@@ -68,8 +68,7 @@ def test_layouts_to_begin_with_do_not_matter():
     assert np.sqrt(np.mean((found[0] - found[1]) ** 2)) < 1e-4
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("turn", [0.0, 0.8])
+@pytest.mark.parametrize("turn", [pytest.param(0.0, marks=pytest.mark.sets), pytest.param(0.8, marks=pytest.mark.slow)])
 def test_at_the_bound(turn):
     """Stars, layouts and statics at the bound of the dense matrix, with true errors; 16 draws."""
     found = gsaoi_calibration.calibrate(turn, 16)

@@ -73,9 +73,9 @@ def test_the_dense_oracle_agrees(kind, epochs):
     [
         pytest.param(6, "proper", None, 0.2, marks=pytest.mark.slow),
         pytest.param(3, "parallax", None, 0.25, marks=pytest.mark.slow),
-        pytest.param(30, "proper", None, 0.1, marks=pytest.mark.slow),
-        pytest.param(30, "proper", 0.3, 0.1, marks=pytest.mark.slow),
-        pytest.param(30, "parallax", None, 0.1, marks=pytest.mark.slow),
+        pytest.param(30, "proper", None, 0.1, marks=pytest.mark.sets),
+        pytest.param(30, "proper", 0.3, 0.1, marks=pytest.mark.sets),
+        pytest.param(30, "parallax", None, 0.1, marks=pytest.mark.sets),
     ],
 )
 def test_absolute_errors_are_calibrated(n, kind, sigma, accuracy):

@@ -49,9 +49,10 @@ def test_the_cure_that_is_named_cures(kind):
     assert_cured(kind, 0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", flawed_sets.CURES)
-@pytest.mark.parametrize("seed", range(1, 11))
+@pytest.mark.parametrize(
+    "seed", [pytest.param(seed, marks=pytest.mark.slow if seed < 3 else pytest.mark.sets) for seed in range(1, 11)]
+)
 def test_the_cure_that_is_named_cures_other_sets(kind, seed):
     assert_cured(kind, seed)
 
@@ -72,8 +73,10 @@ def test_what_a_degree_leaves_of_turbulence_is_foretold():
     assert assert_foretold(0.8, 206) is None
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [200, 201, 202, 204])
+@pytest.mark.parametrize(
+    "seed",
+    [pytest.param(seed, marks=pytest.mark.slow if seed == 200 else pytest.mark.sets) for seed in (200, 201, 202, 204)],
+)
 @pytest.mark.parametrize("size", [0.8, 3.0])
 def test_what_a_degree_leaves_of_turbulence_is_foretold_in_other_sets(size, seed):
     about = assert_foretold(size, seed)
@@ -144,8 +147,9 @@ def test_of_three_cures_of_a_camera_the_right_one_is_named():
     assert_camera_is_cured("layout", 0, n=5, n_stars=100)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", four_detectors.CURES)
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "seed", [pytest.param(seed, marks=pytest.mark.slow if seed == 1 else pytest.mark.sets) for seed in range(6)]
+)
 def test_of_three_cures_of_a_camera_the_right_one_is_named_in_other_sets(kind, seed):
     assert_camera_is_cured(kind, seed)

@@ -524,26 +524,33 @@ def test_expected_scatter_takes_an_error_for_each_position():
     assert mixed[1] > 1.7 * same[1]
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.AssumptionWarning")  # the alarm is not what is tested
-def test_the_choice_costs_little():
+@pytest.mark.parametrize(
+    "by_degree",
+    [
+        pytest.param((0.5,) * 4, marks=pytest.mark.sets),
+        pytest.param((0.5, 0.3, 0.1, 0.05), marks=pytest.mark.sets),
+        pytest.param((0.5, 0.2), marks=pytest.mark.slow),
+        pytest.param((0.0,), marks=pytest.mark.sets),
+    ],
+)
+def test_the_choice_costs_little(by_degree):
     """Mean error of new positions with the degree chosen, against the best of 0 to 4, which is not known."""
-    for by_degree in ((0.5,) * 4, (0.5, 0.3, 0.1, 0.05), (0.5, 0.2), (0.0,)):
-        for n_stars in (15, 30, 80):
-            rows = []
-            for seed in range(5):
-                sim = simulate(n_stars, *by_degree, seed=seed)
-                grid = sim.truth.grid("exp00", 20)
+    for n_stars in (15, 30, 80):
+        rows = []
+        for seed in range(5):
+            sim = simulate(n_stars, *by_degree, seed=seed)
+            grid = sim.truth.grid("exp00", 20)
 
-                def error(degree, sim=sim, grid=grid):
-                    try:
-                        made = solved(sim, degree=degree)
-                        scatter = accuracy.new_scatter(made, sim.truth.distort, grid, 0.14)
-                    except (FoldError, SolveError):  # no answer for so few stars
-                        return np.inf
-                    return np.sqrt(np.nanmean(scatter**2))
+            def error(degree, sim=sim, grid=grid):
+                try:
+                    made = solved(sim, degree=degree)
+                    scatter = accuracy.new_scatter(made, sim.truth.distort, grid, 0.14)
+                except (FoldError, SolveError):  # no answer for so few stars
+                    return np.inf
+                return np.sqrt(np.nanmean(scatter**2))
 
-                rows.append([error(degree) for degree in ("auto", 0, 1, 2, 3, 4)])
-            chosen, *fixed = np.mean(rows, axis=0)
-            # fifteen stars and ten modes: leaving one star out is leaving much out, and one choice of five weighs much
-            assert chosen < (1.4 if n_stars == 15 else 1.05) * min(fixed), (by_degree, n_stars)
+            rows.append([error(degree) for degree in ("auto", 0, 1, 2, 3, 4)])
+        chosen, *fixed = np.mean(rows, axis=0)
+        # fifteen stars and ten modes: leaving one star out is leaving much out, and one choice of five weighs much
+        assert chosen < (1.4 if n_stars == 15 else 1.05) * min(fixed), n_stars

@@ -91,16 +91,17 @@ def test_two_fields_once(name):
     assert abs(chi2 - 1) < 0.12
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("n_sets", [pytest.param(8, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.sets)])
 @pytest.mark.parametrize("name", SETTINGS)
-def test_two_fields_are_at_the_bound_and_calibrated(name):
+def test_two_fields_are_at_the_bound_and_calibrated(name, n_sets):
+    wide = np.sqrt(20 / n_sets)  # by the standard errors
     relative, stated, absolute, stated_absolute, static, bound, chi2 = np.mean(
-        [figures(seed, **SETTINGS[name]) for seed in range(20)], axis=0
+        [figures(seed, **SETTINGS[name]) for seed in range(n_sets)], axis=0
     )
-    assert 0.9 < relative / stated < 1.1
-    assert 0.8 < absolute / stated_absolute < 1.2
-    assert np.sqrt(static / bound) < 1.1
-    assert abs(chi2 - 1) < 0.03
+    assert relative / stated == pytest.approx(1, abs=0.1 * wide)
+    assert absolute / stated_absolute == pytest.approx(1, abs=0.2 * wide)
+    assert np.sqrt(static / bound) < 1 + 0.1 * wide
+    assert abs(chi2 - 1) < 0.03 * wide
 
 
 def test_with_nothing_in_common_each_is_as_by_itself():

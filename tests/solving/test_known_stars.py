@@ -42,7 +42,7 @@ def after_pointing(base, stars, positions, true):
     [
         (6, {}, 0.5),
         pytest.param(40, {}, 0.2, marks=pytest.mark.slow),
-        pytest.param(40, {"dynamic": 0.1}, 0.2, marks=pytest.mark.slow),
+        pytest.param(40, {"dynamic": 0.1}, 0.2, marks=pytest.mark.sets),
     ],
 )
 def test_absolute_errors_have_those_of_the_solution(n_sets, setting, tolerance):

@@ -80,7 +80,7 @@ ROWS = {
 @pytest.mark.parametrize(
     "row", [pytest.param(row, marks=[pytest.mark.slow] * (k > 1)) for k, row in enumerate(reversed(ROWS))]
 )
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.sets) for seed in range(2, 8))])
 def test_large_distortions_cost_no_chi2(row, seed):
     """Where a convention holds the plane it is 80 and 270 times its degrees of freedom in the first two rows."""
     words, prior = ROWS[row]

@@ -375,8 +375,13 @@ def test_none_is_odd_by_chance_where_all_have_one_distortion():
         assert np.mean(np.concatenate([table["ratio"] for table in tables]) ** 2) == pytest.approx(1, abs=0.15)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("words", [{}, {"nightly": 0.0, "single": 0.03, "roll": 0.7}])
+@pytest.mark.parametrize(
+    "words",
+    [
+        pytest.param({}, marks=pytest.mark.sets),
+        pytest.param({"nightly": 0.0, "single": 0.03, "roll": 0.7}, marks=pytest.mark.slow),
+    ],
+)
 def test_departures_of_nights_are_what_their_errors_lead_to_expect(words):
     tables = [solved(Nights(seed, **words)).nights for seed in range(15)]
     squares = np.concatenate([table["chi2"] / table["dof"] for table in tables])
@@ -387,8 +392,14 @@ def test_departures_of_nights_are_what_their_errors_lead_to_expect(words):
     assert not any(table["odd"].any() for table in tables)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("roll", [0.0, 0.7, 30.0])
+@pytest.mark.parametrize(
+    "roll",
+    [
+        pytest.param(0.0, marks=pytest.mark.sets),
+        pytest.param(0.7, marks=pytest.mark.slow),
+        pytest.param(30.0, marks=pytest.mark.sets),
+    ],
+)
 def test_odd_nights_are_found_by_name(roll):
     for seed in range(6):
         table = solved(Nights(seed, odd=0.5, roll=roll)).nights
@@ -465,17 +476,16 @@ def test_absolute_errors_of_a_night_with_others_as_prior_are_right():
 # --- absolute errors -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "low", "high"),
     [
-        ({}, 0.75, 1.35),
-        ({"roll": 0.7}, 0.75, 1.35),
-        ({"motion": 0.25}, 0.65, 1.3),
-        ({"nights": 2}, 0.7, 1.3),
-        ({"nights": 3}, 0.7, 1.3),
-        ({"nightly": 0.0, "single": 0.03}, 0.75, 1.3),
-        ({"nightly": 0.0, "single": 0.03, "motion": 0.25}, 0.65, 1.3),
+        pytest.param({}, 0.75, 1.35, marks=pytest.mark.sets),
+        pytest.param({"roll": 0.7}, 0.75, 1.35, marks=pytest.mark.slow),
+        pytest.param({"motion": 0.25}, 0.65, 1.3, marks=pytest.mark.slow),
+        pytest.param({"nights": 2}, 0.7, 1.3, marks=pytest.mark.sets),
+        pytest.param({"nights": 3}, 0.7, 1.3, marks=pytest.mark.slow),
+        pytest.param({"nightly": 0.0, "single": 0.03}, 0.75, 1.3, marks=pytest.mark.sets),
+        pytest.param({"nightly": 0.0, "single": 0.03, "motion": 0.25}, 0.65, 1.3, marks=pytest.mark.sets),
     ],
 )
 def test_absolute_errors_are_right(words, low, high):
@@ -485,8 +495,10 @@ def test_absolute_errors_are_right(words, low, high):
     assert low < off / stated < high
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("words", [{}, {"roll": 0.7, "motion": 0.25}])
+@pytest.mark.parametrize(
+    "words",
+    [pytest.param({}, marks=pytest.mark.slow), pytest.param({"roll": 0.7, "motion": 0.25}, marks=pytest.mark.sets)],
+)
 def test_an_odd_night_does_little_harm(words):
     options = {"motion": "proper"} if "motion" in words else {}
     sets = [Nights(seed, odd=0.5, **words) for seed in range(20)]

@@ -123,8 +123,14 @@ def test_what_is_said_to_show_shows(nu):
     assert addition_that_shows(0) == np.inf
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("prior", "rolls"), [(True, 0.0), (True, 30.0), (False, 30.0)])
+@pytest.mark.parametrize(
+    ("prior", "rolls"),
+    [
+        pytest.param(True, 0.0, marks=pytest.mark.sets),
+        pytest.param(True, 30.0, marks=pytest.mark.slow),
+        pytest.param(False, 30.0, marks=pytest.mark.sets),
+    ],
+)
 def test_statistics_of_right_references_are_those_of_chance(prior, rolls):
     made = [solved(seed, prior=prior, taken={"rolls": rolls}).gauge.tie.agreement for seed in range(40)]
     for chi2, dof in ((sum(m.chi2 for m in made), sum(m.dof for m in made)),
@@ -134,8 +140,14 @@ def test_statistics_of_right_references_are_those_of_chance(prior, rolls):
     assert stats.kstest(p, "uniform").pvalue > 1e-3
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("prior", "rolls"), [(True, 0.0), (True, 30.0), (False, 30.0)])
+@pytest.mark.parametrize(
+    ("prior", "rolls"),
+    [
+        pytest.param(True, 0.0, marks=pytest.mark.sets),
+        pytest.param(True, 30.0, marks=pytest.mark.slow),
+        pytest.param(False, 30.0, marks=pytest.mark.sets),
+    ],
+)
 def test_wrong_references_are_found(prior, rolls):
     for fault in ("bent by 1 px", "five years off", "errors x 1000"):
         states = [check_of(solved(seed, fault, prior=prior, taken={"rolls": rolls})).state for seed in range(10)]
@@ -193,8 +205,14 @@ def test_what_bends_a_reference_alone_bends_nothing_else(degree, options):
     assert f"a map of degree {degree} that is its own" in second.gauge.tie.statement
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("degree", "error", "prior"), [(2, 0.001, True), (3, 0.01, True), (3, 0.001, False)])
+@pytest.mark.parametrize(
+    ("degree", "error", "prior"),
+    [
+        pytest.param(2, 0.001, True, marks=pytest.mark.sets),
+        pytest.param(3, 0.01, True, marks=pytest.mark.slow),
+        pytest.param(3, 0.001, False, marks=pytest.mark.slow),
+    ],
+)
 def test_errors_beside_a_map_of_the_reference_alone_are_calibrated(degree, error, prior, monkeypatch):
     """20 sets each: absolute errors, and those of the catalogue's stars relative to the others."""
     monkeypatch.setattr(made_catalogues, "ERROR", error)

@@ -113,16 +113,15 @@ def test_absolute_positions_become_as_good_as_relative_ones(sim):
     assert after.chi2 / after.dof == pytest.approx(before.chi2 / before.dof, abs=0.05)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "error", "settings"),
     [
-        (60, 0.02, {}),
-        (30, 0.001, {}),
-        (15, 0.05, {}),
-        (4, 0.05, {}),
-        (40, 0.02, {"degree": 1}),
-        (40, 0.02, {"degree": 0, "dynamic": 0.0, "static": 0.0}),
+        pytest.param(60, 0.02, {}, marks=pytest.mark.slow),
+        pytest.param(30, 0.001, {}, marks=pytest.mark.sets),
+        pytest.param(15, 0.05, {}, marks=pytest.mark.sets),
+        pytest.param(4, 0.05, {}, marks=pytest.mark.slow),
+        pytest.param(40, 0.02, {"degree": 1}, marks=pytest.mark.sets),
+        pytest.param(40, 0.02, {"degree": 0, "dynamic": 0.0, "static": 0.0}, marks=pytest.mark.slow),
     ],
 )
 def test_absolute_errors_are_calibrated(n, error, settings):
@@ -182,9 +181,14 @@ def test_stars_are_as_good_as_a_good_catalogue():
     assert np.mean(pulls_of[False]) == pytest.approx(1, abs=0.4)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("n", "error", "blunders"), [(30, 0.001, 0.0), (60, 1.0, 0.0), (60, 0.05, 0.2), (30, 0.01, 0.2)]
+    ("n", "error", "blunders"),
+    [
+        pytest.param(30, 0.001, 0.0, marks=pytest.mark.slow),
+        pytest.param(60, 1.0, 0.0, marks=pytest.mark.sets),
+        pytest.param(60, 0.05, 0.2, marks=pytest.mark.sets),
+        pytest.param(30, 0.01, 0.2, marks=pytest.mark.slow),
+    ],
 )
 def test_stars_of_a_catalogue_are_calibrated(n, error, blunders):
     """20 sets each; blunders of 1 px are left out, and a poor catalogue makes no relative error larger."""

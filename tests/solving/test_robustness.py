@@ -242,11 +242,13 @@ def test_no_more_is_left_out_than_leaves_something_to_judge_by():
     assert {check.name: check.state for check in solution.checks}["chi2"] == "fail"
 
 
-@pytest.mark.slow
-def test_clean_sets_lose_nothing():
-    """200 sets, half of them of three exposures; and errors stated 1.5 times too small."""
+@pytest.mark.parametrize(
+    "n_sets", [pytest.param(60, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.sets)]
+)
+def test_clean_sets_lose_nothing(n_sets):
+    """Half of them of three exposures; and errors stated 1.5 times too small."""
     n_rejected = 0
-    for seed in range(200):
+    for seed in range(n_sets):
         sim = precise(3 if seed % 2 else 6, n_stars=25, seed=seed, noise=1.5 if seed % 4 > 1 else 1.0)
         solution = solve(sim.matches, prior=Prior(sim.truth.static) if seed % 3 else None)
         assert not solution.left_out

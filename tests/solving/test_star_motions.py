@@ -153,7 +153,7 @@ def test_relative_errors_are_calibrated(n, accuracy):
     [
         (12, "proper", 0.25),  # of 16 modes
         pytest.param(150, "proper", 0.1, marks=pytest.mark.slow),
-        pytest.param(150, "parallax", 0.1, marks=pytest.mark.slow),
+        pytest.param(150, "parallax", 0.1, marks=pytest.mark.sets),
     ],
 )
 def test_absolute_errors_of_motions_are_calibrated(n, kind, accuracy):
@@ -217,17 +217,20 @@ def test_auto_decides_by_evidence(size, chosen):
     assert right == 5
 
 
-@pytest.mark.slow
-def test_auto_decides_by_evidence_in_many_sets():
+@pytest.mark.parametrize(
+    "n_sets", [pytest.param(30, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.sets)]
+)
+def test_auto_decides_by_evidence_in_many_sets(n_sets):
     wrong, missed = 0, 0
-    for seed in range(100):
+    for seed in range(n_sets):
         still = field(60, motion=0.0, seed=seed)
         error = np.median(solve(still.matches, motion="proper", clip=None).stars["vx_err"].value)
         wrong += solve(still.matches, motion="auto", clip=None).settings.motion is not None
         moving = field(60, motion=1.1 * error, seed=seed)
         missed += solve(moving.matches, motion="auto", clip=None).settings.motion is None
-    assert wrong <= 5
-    assert missed <= 5
+    few = 0.05 * n_sets + (1 if n_sets < 100 else 0)  # a standard deviation
+    assert wrong <= few
+    assert missed <= few
 
 
 def test_the_scatter_of_motions_is_found():
@@ -459,7 +462,7 @@ def test_a_catalogue_ties_positions_at_the_epoch_of_the_motions():
     [
         pytest.param(4, 0.2, None, marks=pytest.mark.slow),
         pytest.param(2, 0.3, 0.3, marks=pytest.mark.slow),
-        pytest.param(60, 0.1, None, marks=pytest.mark.slow),
+        pytest.param(60, 0.1, None, marks=pytest.mark.sets),
     ],
 )
 def test_absolute_motions_tied_to_a_catalogue_are_calibrated(n, accuracy, sigma):
@@ -589,8 +592,13 @@ def bound(sim, solution):
     return out
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "epochs", "realisations"), [("proper", THREE, 12), ("parallax", FIVE, 12)])
+@pytest.mark.parametrize(
+    ("kind", "epochs", "realisations"),
+    [
+        pytest.param("proper", THREE, 12, marks=pytest.mark.sets),
+        pytest.param("parallax", FIVE, 12, marks=pytest.mark.slow),
+    ],
+)
 def test_positions_motions_and_parallaxes_are_at_the_bound(kind, epochs, realisations):
     """1.05 times the bound at most, over 300 stars in each realisation."""
     squares, limit = [], []

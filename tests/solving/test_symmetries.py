@@ -163,10 +163,12 @@ def solved():
 
 
 def cases(*without):
-    """Settings and seeds, of which those beyond the first are slow, and what is much like another or takes long."""
+    """Settings and seeds; those beyond the first are sets, and slow is what is much like another or takes long."""
     made = [(setting, seed) for setting in SETTINGS if setting not in without for seed in range(2)]
-    slow = [seed > 0 or setting not in QUICK for setting, seed in made]
-    return [pytest.param(*each, marks=[pytest.mark.slow] * s) for each, s in zip(made, slow, strict=True)]
+    return [
+        pytest.param(*each, marks=pytest.mark.sets if each[1] else [pytest.mark.slow] * (each[0] not in QUICK))
+        for each in made
+    ]
 
 
 @pytest.mark.parametrize(("setting", "seed"), cases())

@@ -287,14 +287,13 @@ def test_a_term_is_checked(given, said):
         ld.Term(**{"name": "a", "columns": lambda observed: observed.pixels[None], "numbers": ("n",)} | given)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bent", "terms"),
     [
-        ({"refraction": 0.02}, ["refraction"]),
-        ({"phase": 0.03}, ["pixel_phase"]),
-        ({"refraction": 0.02, "phase": 0.03}, ["refraction", "pixel_phase"]),
-        ({}, ["refraction", "pixel_phase"]),
+        pytest.param({"refraction": 0.02}, ["refraction"], marks=pytest.mark.sets),
+        pytest.param({"phase": 0.03}, ["pixel_phase"], marks=pytest.mark.sets),
+        pytest.param({"refraction": 0.02, "phase": 0.03}, ["refraction", "pixel_phase"], marks=pytest.mark.slow),
+        pytest.param({}, ["refraction", "pixel_phase"], marks=pytest.mark.slow),
     ],
 )
 def test_errors_are_calibrated(bent, terms):

@@ -135,8 +135,10 @@ def test_what_cannot_be_done_is_said():
         ld.solve(many, degree=1, terms="turbulence")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("rms", "n_sets", "right_to"), [(0.1, 6, 0.2), (2.0, 6, 0.1)])
+@pytest.mark.parametrize(
+    ("rms", "n_sets", "right_to"),
+    [pytest.param(0.1, 6, 0.2, marks=pytest.mark.slow), pytest.param(2.0, 6, 0.1, marks=pytest.mark.sets)],
+)
 @pytest.mark.filterwarnings("ignore:turbulence has not settled")  # of fields 200 times as large as errors
 def test_errors_are_calibrated(rms, n_sets, right_to):
     """Of stars, and of others that took no part."""
