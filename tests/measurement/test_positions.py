@@ -431,7 +431,11 @@ FRAMES = {
 }
 
 
-@pytest.mark.parametrize("kind", FRAMES)
+#: What is much like another of them.
+LIKE = ("big-endian integers", "negative sky", "steep sky", "gaps")
+
+
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in LIKE)) for kind in FRAMES])
 def test_frames_as_they_come(field, kind):
     """All kinds: no false star, the errors stay true."""
     xy, clean = field
