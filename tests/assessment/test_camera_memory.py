@@ -206,6 +206,7 @@ def test_what_a_night_was_solved_with_does_not_count(three):
     assert "One night does not tell how far nights scatter" in str(free)
 
 
+@pytest.mark.slow
 def test_nights_one_after_the_other_or_in_any_order_are_the_same(three):
     all_at_once = ld.combine_nights(three)
     later = ld.combine_nights([ld.combine_nights(three[:2]), three[2]])

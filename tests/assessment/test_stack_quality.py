@@ -281,6 +281,7 @@ def test_corrections_sharpen_in_turn(stacks):
     assert method.position < 0.01
 
 
+@pytest.mark.slow
 def test_zooms_have_their_star_in_the_middle(stacks, solution):
     made, comparison = stacks
     assert len(made.zooms) == 3

@@ -928,6 +928,7 @@ class TestFrames:
             (e.name, e.exposure, e.detector) for e in known
         ]
 
+    @pytest.mark.slow
     def test_layout_by_headers(self, frames, measured):
         """Without a camera the headers say how the detectors lie; here they know nothing of the distortion."""
         _, camera, _ = frames

@@ -186,7 +186,7 @@ def gwcs_of_asdf(*keys):
     [
         pytest.param("cal.fits", gwcs_of_fits, marks=pytest.mark.slow),
         pytest.param("model.asdf", gwcs_of_asdf("meta", "wcs"), marks=pytest.mark.slow),
-        ("wcs.asdf", gwcs_of_asdf("wcs")),
+        pytest.param("wcs.asdf", gwcs_of_asdf("wcs"), marks=pytest.mark.slow),
     ],
     ids=["frames", "models", "bare gwcs"],
 )

@@ -190,8 +190,9 @@ def test_noise_frame_is_left_out_by_name():
     assert_good(table, matches)
 
 
+@pytest.mark.slow
 def test_bad_frame_of_many_detections_poisons_nothing():
-    table = make_field(100, *six_poses(0.5, 100), seed=1)
+    table = make_field(60, *six_poses(0.5, 100), seed=1)
     clean = match(table, shape=SHAPE)
     xy = np.random.default_rng(9).uniform(0, 2047, (200, 2))
     matches = match(vstack([table, detections("bad", xy, flux=1.0, truth=-1)]), shape=SHAPE)
@@ -320,7 +321,7 @@ def test_headers_all_wrong_are_ignored_with_a_warning():
         pytest.param({"scale": 0.026 / 3600}, marks=pytest.mark.slow),
         pytest.param({"flip": True}, marks=pytest.mark.slow),
         pytest.param({"error": (1229, -1229)}, marks=pytest.mark.slow),
-        {"angle": 12},
+        pytest.param({"angle": 12}, marks=pytest.mark.slow),
     ],
     ids=str,
 )

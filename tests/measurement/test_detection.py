@@ -106,6 +106,7 @@ def test_smooth_light_is_exact_on_a_slope_beside_edges_and_gaps():
     assert extrapolated[60 // step, 10] < 1e-3
 
 
+@pytest.mark.slow
 def test_variance_is_that_of_the_sky_in_a_crowded_field_with_halos():
     """The map of `prepare` holds the structure of the halos."""
     rng, size = np.random.default_rng(7), 512

@@ -182,6 +182,7 @@ def test_moffat_profiles_would_not_do(made):
     assert rms(best[ratio[star] > THIRDS[2]]) > 1.5
 
 
+@pytest.mark.slow
 def test_the_centre_is_core_weighted(made, psf):
     """The true core-weighted centre, computed from the pupil, is found; that of the pupil's origin is elsewhere."""
     _, xy, _, ratio = night()

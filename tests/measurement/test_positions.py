@@ -211,7 +211,9 @@ def test_blends_fitted_together_are_better():
     assert np.all(1.4826 * alone[2:] > 1.3)
 
 
-@pytest.mark.parametrize("blends", ["alone", pytest.param("together", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "blends", [pytest.param("alone", marks=pytest.mark.slow), pytest.param("together", marks=pytest.mark.slow)]
+)
 def test_isolated_stars_of_a_crowded_field_stay_calibrated(blends):
     """One star every 4 FWHM: those without another one in 3 FWHM, detected or not."""
     rng, fwhm, size, z = np.random.default_rng(14), 3.5, 450, []

@@ -534,7 +534,13 @@ def test_an_exposure_that_bends_more_than_others_does_not_contradict_them():
 
 @no_position
 @pytest.mark.parametrize(
-    ("share", "size", "serves"), [(0.01, 0.3, True), (0.02, 0.3, True), (0.04, 0.2, True), (0.3, 20.0, False)]
+    ("share", "size", "serves"),
+    [
+        (0.01, 0.3, True),
+        pytest.param(0.02, 0.3, True, marks=pytest.mark.slow),
+        pytest.param(0.04, 0.2, True, marks=pytest.mark.slow),
+        (0.3, 20.0, False),
+    ],
 )
 @pytest.mark.parametrize("compiled_from", [0, 20_000])
 def test_a_plain_fit_leads_to_the_same_observations_as_robust_start_values(

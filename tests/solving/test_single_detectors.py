@@ -69,6 +69,7 @@ def test_errors(gsaoi):
     assert 0.35 < np.mean(absolute) < 1.5
 
 
+@pytest.mark.slow
 def test_it_is_what_it_says(drawn, gsaoi, tmp_path):
     """A solution of single detectors, of which WCSs, residuals and files are as of any other."""
     _, table, solution = drawn
@@ -102,6 +103,7 @@ def test_one_detector_is_as_without_camera(gsaoi):
     assert np.sqrt(np.mean((both[0] - both[1]) ** 2)) < 0.1 * np.nanmedian(usual.stars["x_err"].value)
 
 
+@pytest.mark.slow
 def test_other_corrections_are_of_single_detectors_too(drawn, gsaoi):
     _, table, solution = drawn
     compared = baselines.compare(legdistort.Matches.from_table(table, camera=gsaoi), solution)
