@@ -16,7 +16,7 @@ WITHOUT_EXAMPLE = {
 
 
 #: What co-adds or measures whole nights.
-LONG = ("Catalogue", "Mosaic", "catalogue", "run", "coadd", "refine")
+LONG = ("Catalogue", "Mosaic", "catalogue", "run", "coadd", "refine", "measure")
 
 
 @pytest.mark.parametrize(

@@ -534,7 +534,7 @@ SOLVED_ROWS = [
 ]
 
 
-@pytest.mark.parametrize(("given", "setting"), crossed(SOLVED_ROWS, 4))
+@pytest.mark.parametrize(("given", "setting"), crossed(SOLVED_ROWS, 6))
 def test_solve(given, setting, tmp_path):
     options = {"degree": 1} | resolved(given.options, setting)
     if options["degree"] is None:

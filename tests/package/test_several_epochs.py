@@ -76,7 +76,9 @@ def test_nights_that_cannot_be(settings, message):
         simulate_exposures(small=True, n_stars=20, **settings)
 
 
-@pytest.mark.parametrize("tied", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize(
+    "tied", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.slow)]
+)
 def test_stars_at_another_time_are_those_of_a_solution_of_that_time(tied):
     """As of a solution whose positions are of that time, but for the gauge."""
     sim = field(60, FIVE, parallax=0.1)
@@ -134,7 +136,9 @@ def test_a_position_is_carried_along_the_path_of_its_star(moving):
         assert_allclose(a, b)
 
 
-@pytest.mark.parametrize("kind", [pytest.param("proper", marks=pytest.mark.slow), "parallax"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param("proper", marks=pytest.mark.slow), pytest.param("parallax", marks=pytest.mark.slow)]
+)
 def test_errors_of_positions_carried_on_are_calibrated(kind):
     """Fresh measurements in one exposure, carried on by twenty years, after which errors of rates are most of all."""
     pulls, true, stated = [], [], []

@@ -139,6 +139,7 @@ def test_the_kind_of_a_distortion_is_named():
     assert describe(header_distortions([Exposure("a", pixels(), wcs=table)])).startswith("look-up tables, up to")
 
 
+@pytest.mark.slow
 def test_headers_that_differ_give_each_its_own():
     small = {key: value if key.endswith("ORDER") else 0.9 * value for key, value in SIP.items()}
     for change, one in ((1e-4, True), (1e-3, False)):  # of 4 pixels, so 0.0004 and 0.004
@@ -236,7 +237,12 @@ def unused():
 
 
 @pytest.mark.parametrize(
-    "road", [pytest.param("validate", marks=pytest.mark.slow), pytest.param("dropped", marks=pytest.mark.slow), "file"]
+    "road",
+    [
+        pytest.param("validate", marks=pytest.mark.slow),
+        pytest.param("dropped", marks=pytest.mark.slow),
+        pytest.param("file", marks=pytest.mark.slow),
+    ],
 )
 def test_a_distortion_that_is_not_used_is_said_on_every_road(road, unused, tmp_path):
     matches, options = unused if road == "dropped" else unused.without({"e5": "by hand"}), {}

@@ -230,6 +230,7 @@ def test_solutions_follow_it(mask, rough_prior):
     assert np.std(beyond(corrected - holes, holes, mask.size, 1)) < 1.3 * mask.noise
 
 
+@pytest.mark.slow
 def test_by_exposure(mask, rough_prior):
     """Of priors by exposure every one has the table of its own, as a part of it alone."""
     how = {"static": "hold", "exposure_degree": None, "degree": 5}
@@ -282,6 +283,7 @@ def test_the_static_of_a_solution_with_its_errors(tmp_path):
     assert_array_equal([fits.getdata(each) for each in write_maps(known, tmp_path / "t.fits", solution=solution)], maps)
 
 
+@pytest.mark.slow
 def test_the_map_of_one_detector_of_a_camera(tmp_path, capsys):
     """Of a solution and of its camera in a file, by the id; without one it is refused (it was a map of zeros)."""
     night = ld.solve(four_detectors.matches("static", 1), static="fit", layout="fit", degree=2)

@@ -212,6 +212,7 @@ def test_scatter_is_the_papers():
     assert_allclose(out[2], np.sqrt(np.delete(c[:, 2], 3, axis=0).var(axis=0).sum() / 2))
 
 
+@pytest.mark.slow
 def test_corrected_positions_stand_where_they_belong(runs):
     _, solution = runs(gsaoi)[0]
     corrected = accuracy.corrected_positions(solution)

@@ -114,6 +114,7 @@ def test_coefficients(solution, dense, relative):
         assert np.trace(expected) > np.trace(known)  # it is not little
 
 
+@pytest.mark.slow
 def test_stars(solution, dense, relative):
     n = 2 * dense.n_stars
     matrix = solution.estimate.uncertainty.star_matrix.reshape(2, dense.n_stars, 2, dense.n_stars)

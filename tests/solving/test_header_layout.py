@@ -419,8 +419,9 @@ def test_a_catalogue_joins_detectors(n_sets, n_known, error, n_wrong):
     assert squares[:, 0] / squares[:, 1] == pytest.approx(1, abs=0.25 if n_sets > 10 else 0.4)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("dither", [80.0, 12.0])
+@pytest.mark.parametrize(
+    "dither", [pytest.param(80.0, marks=pytest.mark.slow), pytest.param(12.0, marks=pytest.mark.sets)]
+)
 def test_frames(tmp_path, dither):
     """From images with headers to the stars: across the gaps if dithers are larger, else within detectors."""
     night = header_layouts.Night(13, off=2.5, dither=dither, n=8, n_stars=300)
