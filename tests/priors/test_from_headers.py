@@ -92,7 +92,6 @@ def sip_night(night, tmp_path_factory):
     return frames
 
 
-@pytest.mark.slow
 def test_the_prior_of_headers_is_that_of_the_file(tmp_path):
     exposures = [exposure(k) for k in range(3)]
     prior = ld.Prior.from_headers(exposures, degree=3, sigma=0.1, static_sigma=0.2)
@@ -241,7 +240,7 @@ def unused():
     [
         pytest.param("validate", marks=pytest.mark.slow),
         pytest.param("dropped", marks=pytest.mark.slow),
-        pytest.param("file", marks=pytest.mark.slow),
+        "file",
     ],
 )
 def test_a_distortion_that_is_not_used_is_said_on_every_road(road, unused, tmp_path):

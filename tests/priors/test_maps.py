@@ -247,6 +247,7 @@ def test_by_exposure(mask, rough_prior):
     assert solution["m1"].distortion.table == prior.table
 
 
+@pytest.mark.slow
 def test_where_a_table_cannot_be(mask, rough_prior):
     with pytest.raises(SolveError, match=r"turbulence cannot be found beside a prior that has a table"):
         mask.solve(prior=rough_prior, terms="turbulence", static=None, exposure_degree=None)
