@@ -780,12 +780,12 @@ def test_keck_lists_by_the_command_line(shared_data, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_microobservatory_frames(shared_data, tmp_path, capsys):
-    """Six raw, undersampled frames without a WCS, with hot pixels and a drift of 250 px."""
-    frames = sorted((shared_data / "microobs_hatp32" / "frames").glob("*.fits.gz"))[::2]
+    """Four raw, undersampled frames without a WCS, with hot pixels and a drift of 250 px."""
+    frames = sorted((shared_data / "microobs_hatp32" / "frames").glob("*.fits.gz"))[::3]
     how = ["--degree", "2", "--catalogue", "none", "--json", "--quiet"]
     assert main(["run", *map(str, frames), "--out", str(tmp_path / "out"), *how]) == 0
     summary = json.loads(capsys.readouterr().out)
-    assert summary["n_exposures"] == 6
+    assert summary["n_exposures"] == 4
     assert summary["n_stars"] >= 100
     assert summary["left_out"] == {}
     assert summary["fwhm_ratio"] <= 1.25

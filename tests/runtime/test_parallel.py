@@ -555,7 +555,9 @@ class TestMosaicInBlocks:
             assert_same(ld.coadd(exposures, solution, workers=workers, **settings), one)
         assert not any(tmp_path.iterdir())
 
-    @pytest.mark.parametrize("method", [pytest.param("mean", marks=pytest.mark.slow), "clipped"])
+    @pytest.mark.parametrize(
+        "method", [pytest.param("mean", marks=pytest.mark.slow), pytest.param("clipped", marks=pytest.mark.slow)]
+    )
     def test_drizzle_in_processes_gives_the_same_bits(self, monkeypatch, method):
         pytest.importorskip("drizzle")
         solution, exposures = night(uncertainty=np.full(SHAPE, 8.0))

@@ -56,6 +56,7 @@ def test_it_is_found_by_default(far, solution):
     assert "group" not in solution.stars.colnames
 
 
+@pytest.mark.slow
 def test_it_does_not_matter_how_wrong_it_was(near, far, solution):
     """The same night by headers that are ten times nearer: the same stars after the map that nothing determines.
 
@@ -102,7 +103,7 @@ def test_what_nothing_determines_stays_as_headers_have_it(bent):
     [
         pytest.param(2, {"pose_sigma": {"shift": 3.0, "rotation": 0.003}}, marks=pytest.mark.slow),
         pytest.param(2, {"pose_sigma": {"shift": 3.0, "rotation": 0.05}}, marks=pytest.mark.slow),
-        (3, {"layout_sigma": {"shift": 1.0, "rotation": 0.02}}),
+        pytest.param(3, {"layout_sigma": {"shift": 1.0, "rotation": 0.02}}, marks=pytest.mark.slow),
     ],
 )
 def test_what_is_known_little_of_poses_and_layouts_leads_nowhere_astray(bent, degree, stated):
@@ -333,7 +334,7 @@ def test_nothing_stated_of_statics_is_not_none(n_sets):
     assert squares[0] / squares[1] == pytest.approx(1, abs=0.3 if n_sets > 10 else 0.6)
 
 
-@pytest.mark.parametrize("n_sets", [2, pytest.param(20, marks=pytest.mark.sets)])
+@pytest.mark.parametrize("n_sets", [pytest.param(2, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.sets)])
 def test_a_reference_tells_what_exposures_without_widths_cannot(n_sets):
     """Shear and z^2 of the focal plane, where statics are fitted and exposures have nothing of their own."""
     squares, evidence = np.zeros(2), legdistort.Prior(None, sigma="evidence")
