@@ -314,6 +314,7 @@ def test_a_camera_makes_the_next_night_absolute(three):
     assert np.nanmedian(known.stars["x_err_abs"].value) < 0.05
 
 
+@pytest.mark.slow
 def test_the_scatter_of_exposures_is_found_and_stated_for_one_alone(tmp_path):
     """Exposures scatter by as much, degree by degree, as the fields that were drawn."""
     drawn = np.array([modes(field(np.random.default_rng(seed), 0.05)) for seed in range(500)])

@@ -272,6 +272,7 @@ def tied(seed, error=0.05):
     return ld.solve(matches, static="fit", layout="fit", degree=2, reference=known)
 
 
+@pytest.mark.slow
 def test_what_a_reference_tells_of_a_camera_counts():
     """What all detectors share, exposures can take over: 6 directions more are not determined without a reference."""
     night = tied(2)
@@ -290,6 +291,7 @@ def test_what_a_reference_tells_of_a_camera_counts():
     pyplot.close(ax.figure)
 
 
+@pytest.mark.slow
 def test_the_camera_of_a_night_is_that_night_in_a_file_too(tmp_path):
     """A map that all detectors share is with the exposures, and in no camera that was found from them."""
     night = tied(2)
@@ -307,6 +309,7 @@ def test_the_camera_of_a_night_is_that_night_in_a_file_too(tmp_path):
     assert ld.difference(replace(night.camera, detectors=chips), night).sigmas > 8
 
 
+@pytest.mark.slow
 def test_modes_that_a_night_was_given_and_did_not_fit_do_not_count():
     matches, chips = four_detectors.matches("static", 1), {}
     for key, chip in matches.camera.detectors.items():

@@ -125,9 +125,8 @@ def sky_error(night, solution):
 OPTIONS = {}, {"static": "fit"}, {"layout_sigma": {"shift": 2.0, "rotation": 0.2}}
 
 
-@pytest.mark.parametrize(
-    "options", [OPTIONS[0], *(pytest.param(each, marks=pytest.mark.slow) for each in OPTIONS[1:])], ids=str
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("options", OPTIONS, ids=str)
 def test_it_has_no_vote_on_the_sky_whatever_is_fitted(night, matches, options):
     """A quarter of 45 px otherwise; the headers of seven exposures are 3 px off, each."""
     with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
@@ -145,6 +144,7 @@ def test_it_has_no_vote_on_the_sky_whatever_is_fitted(night, matches, options):
     assert np.hypot(figures["1"]["header_x_off_px"], figures["1"]["header_y_off_px"]) < 8
 
 
+@pytest.mark.slow
 def test_it_has_none_where_detectors_are_taken_one_by_one(night, matches):
     """With its vote the sky was 12 px off, its scale by 0.35 %: every detector has poses of its own."""
     with pytest.warns(AssumptionWarning, match=r"headers have detector 3 4\d px \(.* agree to .* by those that agree"):

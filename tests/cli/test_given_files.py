@@ -122,6 +122,7 @@ def test_cameras_and_priors_are_shown(tmp_path, capsys):
     assert "--strict is for a solution: leave it out" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_shape_of_a_header_comes_from_what_it_is_used_with(table, tmp_path, capsys):
     """A text states none: the table of matches does, and the solution that it is compared with."""
     head = write_head(tmp_path / "a.head", barrel(120), cd=matrix(scale=0.01 / 3600), crpix=(1024.5, 1024.5))

@@ -100,6 +100,7 @@ class TestReferencePlane:
         peaks = [m.data[tuple(np.round(xy[covered(mosaic, xy)]).astype(int).T[::-1])] for m in (mosaic, bilinear)]
         assert np.mean(peaks[1] / peaks[0]) < 0.95
 
+    @pytest.mark.slow
     def test_surface_brightness_is_left_alone_on_request(self):
         solution, *_ = plain()
         flat = [Exposure(name, np.full(SHAPE, 7.0)) for name in solution.poses]
@@ -653,6 +654,7 @@ class TestBadInput:
             with pytest.raises(InputError, match=r"must be images as open_exposures .*; give open_exposures"):
                 coadd(given, solution)
 
+    @pytest.mark.slow
     def test_dubious_frames_are_told(self):
         solution, stars, flux = scene(7, rolls=[0] * 7)
         frames = expose(solution, stars, flux, header=fits.Header({"BUNIT": "adu"}))

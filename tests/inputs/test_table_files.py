@@ -430,6 +430,7 @@ def test_from_lists_to_stars_in_the_shell(tmp_path, capsys):
 # --- what a table of stars says of itself --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_stars_say_what_they_are(tmp_path):
     sim = simulate_gsaoi_matches(small=True, seed=3)
     table = sim.matches.table.copy()

@@ -101,6 +101,7 @@ def test_column_and_flag(crowd):
     assert (crowding > LIMIT).any()
 
 
+@pytest.mark.slow
 def test_unresolved_pairs_are_deformed_and_single_stars_are_not():
     rng = np.random.default_rng(4)
     grid = np.stack(np.meshgrid(*[np.arange(12) * 45 + 30.0] * 2), axis=-1).reshape(-1, 2)

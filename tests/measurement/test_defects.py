@@ -193,6 +193,7 @@ def test_what_stays_in_many_exposures():
         assert (table["flags"][:2] == Flag.HOT | Flag.DEFECT).all()
 
 
+@pytest.mark.slow
 def test_a_star_is_none_of_its_own_images_that_persist():
     """For three exposures there is light where it was, ever less; the images are defects, the star is none."""
     xy, flux = stars()

@@ -273,6 +273,7 @@ def test_extreme_strehl_ratios_and_halos(monkeypatch, strehl, halo, stars):
     assert own == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.slow
 def test_errors_grow_where_the_psf_is_wrong(made):
     """A PSF from elsewhere that is not that of the stars: chi2 says so, and errors are larger than with their own."""
     exposure, _, _, _ = night()

@@ -39,6 +39,7 @@ def test_frames_of_several_epochs_show_stars_where_they_are_then():
     assert np.ptp(truth.place("exp05") - truth.positions, axis=0).min() > 5
 
 
+@pytest.mark.slow
 def test_positions_of_such_a_night_give_its_motions():
     sim = simulate_gsaoi_matches(small=True, n_stars=120, motion=0.3, epochs=SIX)
     solution = solve(sim.matches, degree=1, motion="proper", clip=None)

@@ -160,6 +160,7 @@ def test_an_image_that_the_solution_left_out_does_not_tell_where_a_star_is(solut
     assert np.all(without["n"] > 4)  # their fluxes count there
 
 
+@pytest.mark.slow
 def test_an_exposure_that_is_not_in_the_solution_is_left_out_by_name(truth, solution):
     few = exposures_of(truth)[:3]
     strange = replace(few[2], name="strange", exposure="strange")

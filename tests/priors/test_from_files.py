@@ -800,6 +800,7 @@ words = st.sampled_from(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(
     st.dictionaries(keywords, st.one_of(numbers, words), max_size=8), st.sampled_from(["TAN-SIP", "TPV"]), st.booleans()
@@ -828,6 +829,7 @@ trees = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(st.dictionaries(names, trees, max_size=4), st.integers(0, 10**6), st.binary(max_size=3))
 def test_trees_of_any_kind(tmp_path_factory, tree, place, damage):

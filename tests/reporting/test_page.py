@@ -265,6 +265,7 @@ def test_outlying_exposures_are_marked(tables_only):
     assert marked == [Page(text).row(solution.names[3])[7]]
 
 
+@pytest.mark.slow
 def test_trailed_exposures_have_a_row_and_are_marked(solution, tables_only):
     """Three times as long as wide is an ellipticity of 2/3; where no star was measured nothing is stated."""
     names = solution.names
@@ -297,6 +298,7 @@ def test_strong_distortion_is_magnified_less():
     assert "magnified 2 times" in text
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_many_exposures_are_listed_and_the_dozen_that_departs_most_is_drawn():
     solution = make_solution(14, 10)

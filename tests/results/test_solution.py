@@ -280,6 +280,7 @@ def test_names_are_printed_whole():
     assert len({len(row) for row in rows}) == 1
 
 
+@pytest.mark.slow
 def test_size_of_a_pickle():
     """Of 24,000 positions in 60 exposures; equations stay behind, and what was made from the solution."""
     matches = simulate_matches(n_exposures=60, n_stars=400, degree=1, seed=1).matches

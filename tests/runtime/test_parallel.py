@@ -212,6 +212,7 @@ class TestCopies:
         """
         assert in_a_new_process(script) == "False\n"
 
+    @pytest.mark.slow
     def test_a_function_beside_a_block(self, tmp_path):
         """It is at work while the block runs, its files stay, what it warns of and raises arrives."""
         script = """if True:

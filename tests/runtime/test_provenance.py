@@ -246,7 +246,7 @@ while True:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="folders are exchanged in one step there alone")
-@pytest.mark.parametrize("n_reads", [300, pytest.param(10_000, marks=pytest.mark.sets)])
+@pytest.mark.parametrize("n_reads", [100, pytest.param(10_000, marks=pytest.mark.sets)])
 def test_readers_beside_a_writer(tmp_path, n_reads):
     """At 24 commits a second: never files of two runs, and never a folder that is missing.
 

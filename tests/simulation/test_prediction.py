@@ -433,6 +433,7 @@ def test_what_was_asked_for_stays_as_it_was():
         settings.degree = 2
 
 
+@pytest.mark.slow
 def test_relative_errors_do_not_depend_on_what_is_known_of_the_common_map():
     """Without a prior the assumed scatter makes the constraints; positions relative to one another do not change."""
     given = {"n_exposures": 11, "n_stars": 80, "sigma": 0.02, "degree": 3, "dithers": 200.0, "seed": 1}
@@ -456,6 +457,7 @@ def test_a_degree_higher_than_that_of_the_widths_of_a_prior():
     assert 4 in table["degree"]
 
 
+@pytest.mark.slow
 def test_alternatives():
     p = predict(n_exposures=8, n_stars=14, sigma=0.02, dynamic=0.4, dithers=40.0)
     table = p.alternatives()

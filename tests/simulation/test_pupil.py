@@ -232,6 +232,7 @@ def test_a_fit_with_the_true_psf_reaches_the_bound():
     assert np.sqrt(np.mean(z**2)) == pytest.approx(1, abs=3 / np.sqrt(2 * 80))
 
 
+@pytest.mark.slow
 def test_nights_take_a_psf_for_all_exposures_or_one_for_each(arrays):
     kinds = {"n_exposures": 2, "size": 128, "n_stars": 4, "dither": 5.0, "noise": False}
     pupil = PupilPSF(strehl=0.3, halo_fwhm=6.0)
@@ -269,6 +270,7 @@ def test_diffraction_is_that_of_maoppy():
     assert image.max() == pytest.approx(theirs.max(), rel=0.01)
 
 
+@pytest.mark.slow
 def test_part_of_the_light_in_the_core_is_that_of_maoppy():
     """A Strehl ratio says the same of the halo as the phase variance that PSFAO19 has for it."""
     model = psfao(4.0, npix=1024)

@@ -68,7 +68,7 @@ EVIDENCE = ld.Prior(np.zeros((2, 1)), sigma="evidence", source="nothing")
         {"static": "fit", "dynamic": 0.0},
         {"loss": "cauchy", "clip": None},
         {"errors": "floor"},
-        {"prior": EVIDENCE},
+        pytest.param({"prior": EVIDENCE}, marks=pytest.mark.slow),
         {"motion": "proper", "epochs": np.linspace(2010, 2016, 8), "words": {"motion": 0.01}},
     ],
     ids=lambda asked: "-".join(asked) or "plain",

@@ -68,6 +68,7 @@ def test_errors_of_stars_that_wander_are_true(wandering):
     assert found.floor < 0.5 * SIZE
 
 
+@pytest.mark.slow
 def test_words_say_what_was_found_and_what_cannot_be(wandering):
     text = str(wandering[0]["correlated"])
     assert "shared by exposures near one another in" in text

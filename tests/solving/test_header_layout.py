@@ -320,7 +320,7 @@ def known_stars(night):
     return legdistort.Matches.from_table(table, camera=legdistort.Camera("four", detectors))
 
 
-@pytest.mark.parametrize("n_sets", [2, pytest.param(20, marks=pytest.mark.sets)])
+@pytest.mark.parametrize("n_sets", [pytest.param(2, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.sets)])
 def test_nothing_stated_of_statics_is_not_none(n_sets):
     """Absolute errors are true where the focal plane has a distortion that nobody stated; dithers and rolls tell it."""
     squares = np.zeros(2)

@@ -249,6 +249,7 @@ class TestCheck:
         assert "believed, not tested" in check.sentence
         assert "dithers" in check.cure
 
+    @pytest.mark.slow
     def test_one_of_two_detectors_is_named(self):
         """Exposures of two detectors of one field, the prior of the second with the wrong sign."""
         data, truth = dense_model.drawn_set(11, rolls=30.0, n=14)

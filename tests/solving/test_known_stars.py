@@ -40,7 +40,7 @@ def after_pointing(base, stars, positions, true):
 @pytest.mark.parametrize(
     ("n_sets", "setting", "tolerance"),
     [
-        (6, {}, 0.5),
+        pytest.param(6, {}, 0.5, marks=pytest.mark.slow),
         pytest.param(40, {}, 0.2, marks=pytest.mark.slow),
         pytest.param(40, {"dynamic": 0.1}, 0.2, marks=pytest.mark.sets),
     ],

@@ -248,6 +248,7 @@ def test_mismatches_do_not_widen_them():
     )
 
 
+@pytest.mark.slow
 def test_one_prior_one_set_of_widths():
     """A Prior shared by detectors pools them; one each keeps them apart; numbers stay what they are."""
     sim = simulate(14)

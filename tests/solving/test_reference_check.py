@@ -242,7 +242,9 @@ def test_the_degree_that_is_named_cures(degree):
     assert "agree with the exposures" in cured.sentence
 
 
-@pytest.mark.parametrize("options", [{"static": "hold"}, {"static": "hold", "layout": "fit"}])
+@pytest.mark.parametrize(
+    "options", [{"static": "hold"}, pytest.param({"static": "hold", "layout": "fit"}, marks=pytest.mark.slow)]
+)
 def test_detectors_that_are_distorted_are_to_be_fitted(options):
     """Nothing was given of their distortions that could be left out; with these fitted the reference agrees."""
     matches, rng = four_detectors.matches("static", 2, n=6, n_stars=160), np.random.default_rng(2)

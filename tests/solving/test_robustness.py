@@ -92,6 +92,7 @@ def test_poses_are_those_of_the_exposures_that_agree(n_junk):
     assert list(solution.left_out) == junk
 
 
+@pytest.mark.slow
 def test_a_few_pixels_are_found_by_the_fit():
     """Errors far below those that pairs show, far above those stated."""
     sim = precise(5)
@@ -539,7 +540,7 @@ def test_an_exposure_that_bends_more_than_others_does_not_contradict_them():
         (0.01, 0.3, True),
         pytest.param(0.02, 0.3, True, marks=pytest.mark.slow),
         pytest.param(0.04, 0.2, True, marks=pytest.mark.slow),
-        (0.3, 20.0, False),
+        pytest.param(0.3, 20.0, False, marks=pytest.mark.slow),
     ],
 )
 @pytest.mark.parametrize("compiled_from", [0, 20_000])

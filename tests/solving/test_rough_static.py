@@ -63,6 +63,7 @@ def test_a_static_distortion_that_is_told_badly_is_found():
         assert [each.name for each in found.gauge.unknown] == 2 * ["static"]  # shears: nothing tells of these
 
 
+@pytest.mark.slow
 def test_numbers_are_found_where_poses_are_hardly_known(mask, solution):
     """What follows the numbers may be known to a few digits; the normal equations of these are positive still."""
     with pytest.warns(AssumptionWarning, match="2 of 38 unknowns of the shared distortion are not"):

@@ -155,6 +155,7 @@ def test_what_stars_would_hide_is_not_said_to_be_absent(taken, state):
         assert "turned camera" in found["place"].cure
 
 
+@pytest.mark.slow
 def test_statistics_have_the_mean_they_state():
     found = [residuals(solved(simulated(seed, n_exposures=4, n_stars=30).matches)) for seed in range(25)]
     for get in (

@@ -151,7 +151,7 @@ def test_relative_errors_are_calibrated(n, accuracy):
 @pytest.mark.parametrize(
     ("n", "kind", "accuracy"),
     [
-        (12, "proper", 0.25),  # of 16 modes
+        pytest.param(12, "proper", 0.25, marks=pytest.mark.slow),  # of 16 modes
         pytest.param(150, "proper", 0.1, marks=pytest.mark.slow),
         pytest.param(150, "parallax", 0.1, marks=pytest.mark.sets),
     ],
@@ -538,6 +538,7 @@ def test_pictures_of_motions(sky):
         motion_plots.plot_motions(solve(field(60).matches))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_the_report_shows_motions(tmp_path):
     solution = solve(field(60).matches, motion="auto")
@@ -650,6 +651,7 @@ def test_motions_in_the_shell(tmp_path, capsys):
     assert "proper motions, relative [px/yr]" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_degree_is_chosen_where_stars_move():
     """Stars that are kept out have motions of their own, which are no reason for a higher degree."""
     sim = field(80, degree=2, dynamic=0.5, sigma=0.05, motion=0.5)

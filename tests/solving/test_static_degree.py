@@ -79,6 +79,7 @@ def test_the_degree_that_is_missing_is_named_and_what_it_reaches():
     assert_named(static_set(3, 1), 3, 5)
 
 
+@pytest.mark.slow
 def test_the_same_of_a_camera():
     assert_named(static_set(4, 2, degree=3, n=5, n_stars=120), 2, 3)
 

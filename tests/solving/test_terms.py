@@ -106,6 +106,7 @@ def test_stars_on_orbits_are_kept(term, bent):
     assert np.isnan(dropped.stars["x"][np.isin(dropped.stars["star"], field.odd)]).all()
 
 
+@pytest.mark.slow
 def test_a_term_of_ones_own(tmp_path):
     """Modes of each exposure with a known covariance, as of a deformable mirror at altitude; and written and read."""
     pattern = lambda at: np.sin(2 * np.pi * np.asarray(at)[..., ::-1] / 700.0)  # noqa: E731

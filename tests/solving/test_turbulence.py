@@ -194,6 +194,7 @@ def test_one_exposure_has_its_field_from_a_catalogue():
     assert np.std(corrected.xy - new) < 0.6 * np.std(plain["e00"].correct(seen) - new)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the offsets of the stars from the reference")
 def test_one_exposure_without_turbulence_has_none():
     matches, catalogue, _ = one_exposure(43, rms=0, n_known=200)

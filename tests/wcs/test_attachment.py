@@ -484,6 +484,7 @@ def test_detectors_one_by_one(geometry, mosaic):
     assert names_in(mosaic) == ["PRIMARY", "SCI", "SCI", "ASDF", "ASDF"]
 
 
+@pytest.mark.slow
 def test_errors_and_flags_get_the_wcs_of_their_image(geometry, tmp_path):
     """Of two detectors, each to its own by EXTVER; not what has another shape or is another image."""
     solution = geometry(1, 2.0, shape=SHAPE, names=("night_SCI1", "night_SCI2"))
@@ -612,7 +613,7 @@ def test_head_files_of_packed_frames(one, tmp_path):
     assert repr(item).endswith("px>")
 
 
-@pytest.mark.parametrize("in_place", [True, False])
+@pytest.mark.parametrize("in_place", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_old_texts_beside_new_headers_are_named(geometry, tmp_path, in_place):
     """SWarp would read the old header; nobody is warned of the texts of others, or of those that are written now."""
     names = [f"f{k}" for k in range(5)]

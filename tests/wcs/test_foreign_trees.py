@@ -58,6 +58,7 @@ def yaml_of(content):
     return content[: content.index(b"\n...") + 5].decode()
 
 
+@pytest.mark.slow
 def test_asdf_files_of_roman(night, tmp_path):
     paths, solution = night
     path, name = tmp_path / paths[0].name, solution.names[0]
