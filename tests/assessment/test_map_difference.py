@@ -385,7 +385,7 @@ def test_gwcs_that_end_in_other_frames_are_compared_on_the_sky():
         ld.difference(one, made("v2v3", bent | sheared, None))
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 def test_chances_of_the_detectors_of_a_camera_are_even():
     chances = [
         ld.difference(four(s), ld.solve(four_detectors.matches("static", s), static="fit", layout="fit", degree=2)).p
@@ -417,7 +417,7 @@ def test_chances_are_even_where_nights_scatter():
     [
         pytest.param({}, marks=pytest.mark.slow),
         pytest.param({"turns": (0,), "single": 0.03}, marks=pytest.mark.sets),
-        pytest.param({"turns": (0, 180), "exposures": 8}, marks=pytest.mark.slow),
+        pytest.param({"turns": (0, 180), "exposures": 8}, marks=pytest.mark.sets),
     ],
 )
 def test_chances_are_even_and_five_sigma_are_found(how):

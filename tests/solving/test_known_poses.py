@@ -86,8 +86,8 @@ SELF = {"static": "fit", "exposure_degree": 0}
         pytest.param(40, (0.0, 0.0, 0.0), {"prior": NOTHING}, marks=pytest.mark.slow),
         pytest.param(40, (0.1, 0.01, 1e-4), {"prior": NOTHING}, marks=pytest.mark.slow),
         pytest.param(60, (0.0, 0.0, 0.0), {"static": 1.0}, marks=pytest.mark.slow),
-        pytest.param(60, (0.1, 0.01, 1e-4), {"static": 1.0}, marks=pytest.mark.slow),
-        pytest.param(60, (0.1, 0.0, 1e-4), {"static": 1.0, "roll": 40.0}, marks=pytest.mark.slow),
+        pytest.param(60, (0.1, 0.01, 1e-4), {"static": 1.0}, marks=pytest.mark.sets),
+        pytest.param(60, (0.1, 0.0, 1e-4), {"static": 1.0, "roll": 40.0}, marks=pytest.mark.sets),
         pytest.param(
             60,
             (0.02, 0.01, 1e-5),

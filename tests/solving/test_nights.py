@@ -364,15 +364,15 @@ def test_an_odd_night_shows_where_all_have_one_distortion(errors):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:static='fit'. . of 14")
 def test_none_is_odd_by_chance_where_all_have_one_distortion():
-    """Eight sets each: nights that scatter, and that scatter not at all."""
+    """Four sets each: nights that scatter, and that scatter not at all."""
     for nightly in (0.02, 0.0):
-        sets = (Nights(seed, nightly=nightly, roll=0.7, n_stars=120) for seed in range(8))
+        sets = (Nights(seed, nightly=nightly, roll=0.7, n_stars=120) for seed in range(4))
         tables = [ld.solve(with_fluxes(nights), static="fit", errors="by-brightness").nights for nights in sets]
         assert not any(table["odd"].any() for table in tables)
         p = np.concatenate([table["p"] for table in tables])
         assert p.min() > 1e-3 / 8
-        assert np.mean(p < 0.05) < 0.15  # 0.03 and 0.12
-        assert np.mean(np.concatenate([table["ratio"] for table in tables]) ** 2) == pytest.approx(1, abs=0.15)
+        assert np.mean(p < 0.05) < 0.15 * np.sqrt(2)  # of eight sets 0.03 and 0.12
+        assert np.mean(np.concatenate([table["ratio"] for table in tables]) ** 2) == pytest.approx(1, abs=0.21)
 
 
 @pytest.mark.parametrize(

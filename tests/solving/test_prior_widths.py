@@ -537,8 +537,9 @@ def test_without_a_mean_exposures_are_drawn_to_the_static_distortion_that_they_s
     assert "scatter of a coefficient, found from the exposures" in str(solution)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("dynamic", [0.05, 0.4])
+@pytest.mark.parametrize(
+    "dynamic", [pytest.param(0.05, marks=pytest.mark.slow), pytest.param(0.4, marks=pytest.mark.sets)]
+)
 def test_errors_without_a_mean_are_calibrated(dynamic):
     square, variance = np.sum([_drawn_to_what_they_show(seed, dynamic=dynamic)[:2] for seed in range(20)], axis=0)
     assert square / variance == pytest.approx(1, abs=0.25)

@@ -137,8 +137,9 @@ def test_absolute_errors_are_calibrated(n, error, settings):
     assert np.mean(squares) == pytest.approx(1, abs=0.15)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("static", [0.5, 1.5])
+@pytest.mark.parametrize(
+    "static", [pytest.param(0.5, marks=pytest.mark.slow), pytest.param(1.5, marks=pytest.mark.sets)]
+)
 def test_errors_are_calibrated_under_a_static_distortion_that_nobody_told(static):
     squares = []
     for seed in range(40):

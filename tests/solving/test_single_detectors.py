@@ -51,9 +51,9 @@ def drawn(gsaoi):
 
 @pytest.mark.slow
 def test_errors(gsaoi):
-    """Relative ones, projected as the positions are, and absolute ones: six draws of some fifty modes."""
+    """Relative ones, projected as the positions are, and absolute ones: three draws of some fifty modes."""
     ratios, absolute = [], []
-    for seed in range(6):
+    for seed in range(3):
         night, _, solution = draw(gsaoi, seed)
         true, n = night.sky[solution.estimate.star_names], len(solution.estimate.star_names)
         left = gsaoi_images.without_common_map(solution.estimate.positions, true, 3)
@@ -65,7 +65,7 @@ def test_errors(gsaoi):
         reported = np.stack([solution.stars[name].value for name in ("x_err_abs", "y_err_abs")], axis=1)
         absolute.append(np.mean(without_similarity(solution.estimate.positions, true) ** 2) / np.mean(reported**2))
     print(ratios, absolute)
-    assert np.mean(ratios) == pytest.approx(1, abs=0.35)
+    assert np.mean(ratios) == pytest.approx(1, abs=0.5)
     assert 0.35 < np.mean(absolute) < 1.5
 
 
