@@ -597,7 +597,8 @@ def bound(sim, solution):
     ("kind", "epochs", "realisations"),
     [
         pytest.param("proper", THREE, 12, marks=pytest.mark.sets),
-        pytest.param("parallax", FIVE, 12, marks=pytest.mark.slow),
+        pytest.param("parallax", FIVE, 4, marks=pytest.mark.slow),
+        pytest.param("parallax", FIVE, 12, marks=pytest.mark.sets),
     ],
 )
 def test_positions_motions_and_parallaxes_are_at_the_bound(kind, epochs, realisations):

@@ -84,9 +84,8 @@ def test_the_same_of_a_camera():
     assert_named(static_set(4, 2, degree=3, n=5, n_stars=120), 2, 3)
 
 
-@pytest.mark.parametrize(
-    "seed", [pytest.param(seed, marks=pytest.mark.slow if seed == 3 else pytest.mark.sets) for seed in (3, 4, 5)]
-)
+@pytest.mark.sets
+@pytest.mark.parametrize("seed", [3, 4, 5])
 def test_the_same_of_a_camera_of_degree_5(seed):
     assert_named(static_set(seed, 2), 3, 5)
 
