@@ -443,7 +443,7 @@ def test_the_command(three, tmp_path, capsys):
     [
         pytest.param({"n": 6}, marks=pytest.mark.sets),
         pytest.param({"n": 6, "turns": (0, 40)}, marks=pytest.mark.sets),
-        pytest.param({"n": 8, "rate": 0.05}, marks=pytest.mark.slow),
+        pytest.param({"n": 8, "rate": 0.05}, marks=pytest.mark.sets),
         pytest.param({"n": 6, "odd": 2}, marks=pytest.mark.slow),
     ],
     ids=str,

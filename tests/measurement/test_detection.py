@@ -46,7 +46,7 @@ def psf(request):
     return as_psf(PupilPSF(resolution=3.5, **request.param), (512, 512))
 
 
-@pytest.mark.parametrize("crowded", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("crowded", [pytest.param(False, marks=pytest.mark.sets), True])
 def test_halos_and_rings_are_no_stars(psf, crowded):
     rng, shape = np.random.default_rng(3), (512, 512)
     xy = rng.uniform(5, 506, (214, 2)) if crowded else scattered(rng, 49, 512)  # one star a (10 FWHM)^2

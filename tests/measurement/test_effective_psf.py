@@ -256,8 +256,8 @@ def test_a_core_that_moffat_profiles_lack(monkeypatch):
         pytest.param(0.1, 10.0, {}, marks=pytest.mark.sets),
         pytest.param(0.6, 10.0, {}, marks=pytest.mark.sets),
         pytest.param(0.1, 40.0, {}, marks=pytest.mark.sets),
-        pytest.param(0.6, 40.0, {}, marks=pytest.mark.slow),
-        pytest.param(0.3, 25.0, {"n": 12}, marks=pytest.mark.slow),
+        pytest.param(0.6, 40.0, {}, marks=pytest.mark.sets),
+        pytest.param(0.3, 25.0, {"n": 12}, marks=pytest.mark.sets),
     ],
 )
 def test_extreme_strehl_ratios_and_halos(monkeypatch, strehl, halo, stars):

@@ -551,7 +551,7 @@ def test_memory_does_not_grow_with_the_number_of_exposures(tmp_path):
     assert peaks[1] - peaks[0] < 3 * 24 * 768**2 / 1024  # kB: what three exposures store, of seven more
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 def test_a_deep_field_with_hits_of_particles():
     """Eleven frames, most of whose stars none of them shows, 1 % of the pixels hit."""
     truth = deep_frames(8, size=512, n_stars=600, hit=0.01)

@@ -152,7 +152,7 @@ def test_relative_errors_are_calibrated(n, accuracy):
     ("n", "kind", "accuracy"),
     [
         pytest.param(12, "proper", 0.25, marks=pytest.mark.slow),  # of 16 modes
-        pytest.param(150, "proper", 0.1, marks=pytest.mark.slow),
+        pytest.param(150, "proper", 0.1, marks=pytest.mark.sets),
         pytest.param(150, "parallax", 0.1, marks=pytest.mark.sets),
     ],
 )

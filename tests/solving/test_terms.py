@@ -331,8 +331,13 @@ def test_accelerations_in_one_word():
         bent.solve(motion="accelerations")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("bent", [{"acceleration": 0.01}, {"orbits": 3.0}])
+@pytest.mark.parametrize(
+    "bent",
+    [
+        pytest.param({"acceleration": 0.01}, marks=pytest.mark.slow),
+        pytest.param({"orbits": 3.0}, marks=pytest.mark.sets),
+    ],
+)
 def test_orbits_are_calibrated(bent):
     """Every star on one is named in every set, false names are rare, and places at three times have right errors."""
     named, false, others, odd_ones = 0, 0, [], []
