@@ -302,7 +302,7 @@ def test_command(tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.AssumptionWarning")  # the headers tell no gain
 def test_scatter_of_real_stars_follows_the_curve(microobservatory):
     """Twelve real, undersampled, drifting frames: solved, and the scatter of every star beside its curve."""

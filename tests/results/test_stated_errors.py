@@ -173,7 +173,7 @@ def test_what_residuals_hardly_determine_stays_with_the_convention(monkeypatch, 
     assert rms_distortion(solution) < 0.2  # 0.15 of the truth, plus noise
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 def test_real_frames_of_one_telescope_have_one_scale(microobservatory):
     """Similarities between these frames leave 0.1 to 0.2 px, and their scales agree to 0.0005."""
     exposures, detections = microobservatory
