@@ -46,6 +46,7 @@ def test_of_equal_undithered_exposures_it_is_the_smallest_dynamic_part():
         assert np.abs((solution.coefficients - SIM.truth.static).mean(axis=0)).max() < 5e-3
 
 
+@pytest.mark.slow
 def test_nothing_stands_between_the_convention_and_the_data():
     """Of a static distortion of many errors, unknown, the convention costs chi2, which is the paper's price."""
     sim = ld.simulate_matches(seed=1, sigma=0.001, n_stars=100, static=10.0, dither=250.0)

@@ -135,6 +135,7 @@ def test_stars_of_a_relative_solution_are_means_of_corrected_positions():
     )
 
 
+@pytest.mark.slow
 def test_relative_errors_hold_in_simulation():
     """Of a coefficient: its departures from the mean of many noise draws on one field."""
     departures, stated = [], None
@@ -267,6 +268,7 @@ def test_errors_by_star_make_up_b():
     assert_allclose(design.T @ left, 0, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_report_has_the_comparison(compared):
     page = report.render(compared["all distortions solved"], comparison=compared)

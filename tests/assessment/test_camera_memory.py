@@ -135,7 +135,11 @@ def squares(sets, date):
 
 @pytest.mark.parametrize(
     ("words", "low", "high"),
-    [({"n": 12}, 0.4, 2.2), ({"n": 16, "rate": 0.05}, 0.4, 2.2), ({"n": 12, "odd": 5}, 0.3, 2.2)],
+    [
+        ({"n": 12}, 0.4, 2.2),
+        pytest.param({"n": 16, "rate": 0.05}, 0.4, 2.2, marks=pytest.mark.slow),
+        pytest.param({"n": 12, "odd": 5}, 0.3, 2.2, marks=pytest.mark.slow),
+    ],
     ids=["constant", "drift", "odd"],
 )
 def test_sizes_are_found(words, low, high):
@@ -144,15 +148,14 @@ def test_sizes_are_found(words, low, high):
     assert drifts == (2 if "rate" in words else 0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "low", "high"),
     [
-        ({"n": 20}, 0.8, 1.25),
-        ({"n": 40, "rate": 0.05}, 0.7, 1.25),
-        ({"n": 20, "odd": 5}, 0.6, 1.25),
-        ({"n": 2}, 0.6, 1.4),
-        ({"n": 3}, 0.6, 1.4),
+        pytest.param({"n": 20}, 0.8, 1.25, marks=pytest.mark.slow),
+        pytest.param({"n": 40, "rate": 0.05}, 0.7, 1.25, marks=pytest.mark.sets),
+        pytest.param({"n": 20, "odd": 5}, 0.6, 1.25, marks=pytest.mark.sets),
+        pytest.param({"n": 2}, 0.6, 1.4, marks=pytest.mark.sets),
+        pytest.param({"n": 3}, 0.6, 1.4, marks=pytest.mark.slow),
     ],
     ids=["constant", "drift", "odd", "two", "three"],
 )
@@ -205,6 +208,7 @@ def test_what_a_night_was_solved_with_does_not_count(three):
     assert "One night does not tell how far nights scatter" in str(free)
 
 
+@pytest.mark.slow
 def test_nights_one_after_the_other_or_in_any_order_are_the_same(three):
     all_at_once = ld.combine_nights(three)
     later = ld.combine_nights([ld.combine_nights(three[:2]), three[2]])
@@ -214,6 +218,7 @@ def test_nights_one_after_the_other_or_in_any_order_are_the_same(three):
             assert_allclose(one, two, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_nights_that_were_solved_together_speak_of_the_camera(three):
     """Their scatter is found inside, counts once, and is that of a further night; truth 0.05 px by order."""
     nights = Nights(4, nights=6, per=4, nightly=0.05, n_stars=90)
@@ -236,6 +241,7 @@ def test_nights_that_were_solved_together_speak_of_the_camera(three):
     assert_allclose(both.scatter, combined.scatter)
 
 
+@pytest.mark.slow
 def test_an_odd_night_among_others_that_were_solved_with_it_is_left_out():
     nights = Nights(4, nights=6, per=4, nightly=0.02, odd=0.5, n_stars=90)
     table = nights.table
@@ -257,6 +263,7 @@ def test_an_odd_night_among_others_that_were_solved_with_it_is_left_out():
     assert len(ld.combine_nights([combined, left_out]).nights) == 2
 
 
+@pytest.mark.slow
 def test_of_two_that_contradict_one_another_neither_is_odd(three):
     other = solved(4242, static(1) + curved(5, 0.7))
     two = ld.combine_nights([three[0], other])
@@ -276,6 +283,7 @@ def test_an_odd_night_is_named_and_counts_less():
     assert "Odd nights, which count less: solution 4." in str(combined)
 
 
+@pytest.mark.slow
 def test_what_nights_of_one_orientation_do_not_determine_hides_no_odd_night(tmp_path):
     """Some combinations of modes are unknown, to the coefficients of all of them: the others are known well."""
     nights = [solved(600 + i, static(3) + curved(650 + i, 0.02), turns=(0,), year=2014 + i) for i in range(4)]
@@ -371,6 +379,7 @@ def test_its_errors_are_calibrated():
     assert 0.6 < off[2] / stated[2] < 1.3
 
 
+@pytest.mark.slow
 def test_the_scatter_of_exposures_is_found_and_stated_for_one_alone(tmp_path):
     """Exposures scatter by as much, degree by degree, as the fields that were drawn."""
     drawn = np.array([modes(field(np.random.default_rng(seed), 0.05)) for seed in range(500)])
@@ -482,6 +491,7 @@ def test_maps_that_say_nothing_are_refused(made, words):
         ld.combine_nights([made(), ld.Prior(modes(static(1)), shape=SHAPE)])
 
 
+@pytest.mark.slow
 def test_the_command(three, tmp_path, capsys):
     for i, each in enumerate(three):
         each.write(tmp_path / f"night{i}.asdf")
@@ -500,9 +510,15 @@ def test_the_command(three, tmp_path, capsys):
     assert_allclose(found.static()[0], ld.combine_nights(three).static()[0], atol=1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    "words", [{"n": 6}, {"n": 6, "turns": (0, 40)}, {"n": 8, "rate": 0.05}, {"n": 6, "odd": 2}], ids=str
+    "words",
+    [
+        pytest.param({"n": 6}, marks=pytest.mark.sets),
+        pytest.param({"n": 6, "turns": (0, 40)}, marks=pytest.mark.sets),
+        pytest.param({"n": 8, "rate": 0.05}, marks=pytest.mark.sets),
+        pytest.param({"n": 6, "odd": 2}, marks=pytest.mark.slow),
+    ],
+    ids=str,
 )
 def test_a_campaign_is_calibrated(words):
     """Ten of each: squared errors of coefficients over their variance, at the last date, of what is determined."""

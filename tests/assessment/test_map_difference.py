@@ -140,7 +140,10 @@ def test_shift_turn_scale_and_parity_do_not_matter(shape):
     assert found.agrees
 
 
-@pytest.mark.parametrize("known", ["nothing", "old", "wrong", "fit"])
+@pytest.mark.parametrize(
+    "known",
+    ["nothing", pytest.param("old", marks=pytest.mark.slow), pytest.param("wrong", marks=pytest.mark.slow), "fit"],
+)
 def test_what_a_night_was_solved_with_does_not_count(known):
     how = {"nothing": {}, "old": {"prior": old(5)}, "wrong": {"prior": ld.Prior(1.3 * modes(static(5)))},
            "fit": {"static": "fit"}}[known]  # fmt: skip
@@ -208,6 +211,7 @@ def test_maps_of_other_kinds_and_of_other_detectors():
         ld.difference(prior, ld.Prior(None, static_sigma=1.0))
 
 
+@pytest.mark.slow
 def test_the_command_compares_files(tmp_path, capsys):
     solution = solved(9)
     solution.write(tmp_path / "night.asdf")
@@ -241,6 +245,7 @@ def four(seed, extra=0.0):
     return ld.Camera("as made", chips)
 
 
+@pytest.mark.slow
 def test_a_night_of_a_camera_is_compared_detector_by_detector():
     matches = four_detectors.matches("static", 1)
     night = ld.solve(matches, static="fit", layout="fit", degree=2)
@@ -271,6 +276,7 @@ def tied(seed, error=0.05):
     return ld.solve(matches, static="fit", layout="fit", degree=2, reference=known)
 
 
+@pytest.mark.slow
 def test_what_a_reference_tells_of_a_camera_counts():
     """What all detectors share, exposures can take over: a shear and a quadratic map, with a reference all is told."""
     night = tied(2)
@@ -286,6 +292,7 @@ def test_what_a_reference_tells_of_a_camera_counts():
     assert wrong.sigmas > 5
 
 
+@pytest.mark.slow
 def test_the_camera_of_a_night_is_that_night_in_a_file_too(tmp_path):
     """A map that all detectors share is with the exposures; the camera that a reference tied states it too."""
     night = tied(2)
@@ -303,6 +310,7 @@ def test_the_camera_of_a_night_is_that_night_in_a_file_too(tmp_path):
     assert ld.difference(replace(night.camera, detectors=chips), night).sigmas > 8
 
 
+@pytest.mark.slow
 def test_modes_that_a_night_was_given_and_did_not_fit_do_not_count():
     matches, chips = four_detectors.matches("static", 1), {}
     for key, chip in matches.camera.detectors.items():
@@ -378,7 +386,7 @@ def test_gwcs_that_end_in_other_frames_are_compared_on_the_sky():
         ld.difference(one, made("v2v3", bent | sheared, None))
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 def test_chances_of_the_detectors_of_a_camera_are_even():
     chances = [
         ld.difference(four(s), ld.solve(four_detectors.matches("static", s), static="fit", layout="fit", degree=2)).p
@@ -405,8 +413,14 @@ def test_chances_are_even_where_nights_scatter():
     assert np.mean(chances["one"]) < 0.15
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("how", [{}, {"turns": (0,), "single": 0.03}, {"turns": (0, 180), "exposures": 8}])
+@pytest.mark.parametrize(
+    "how",
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        pytest.param({"turns": (0,), "single": 0.03}, marks=pytest.mark.sets),
+        pytest.param({"turns": (0, 180), "exposures": 8}, marks=pytest.mark.sets),
+    ],
+)
 def test_chances_are_even_and_five_sigma_are_found(how):
     """20 nights: p is anything, and a camera that is off by 5 sigma in a direction that is determined is found."""
     chances, found = [], 0

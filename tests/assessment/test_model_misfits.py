@@ -94,6 +94,7 @@ def test_a_guiding_jump_is_named_and_a_doubled_frame_is_no_reason_to_doubt_the_o
     assert "leave it out" in check.cure
 
 
+@pytest.mark.slow
 def test_a_psf_of_other_frames_is_seen_and_their_own_passes():
     rng, (y, x) = np.random.default_rng(4), np.mgrid[-48:49, -48:49] / 4
     frames = [frame(f"e{i}", rng) for i in range(2)]

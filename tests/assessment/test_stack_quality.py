@@ -155,7 +155,9 @@ def test_perfect_stack(night, solution, exposures):
     assert str(found).startswith(f"{found.n_stars} stars: FWHM 4.4")
 
 
-@pytest.mark.parametrize("blur", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize(
+    "blur", [pytest.param(0.5, marks=pytest.mark.slow), pytest.param(1.0, marks=pytest.mark.slow), 2.0]
+)
 def test_blur_shows(night, solution, exposures, blur):
     """Gaussians convolved: squares of widths add, peaks go with the area."""
     wide = np.hypot(SIGMA, blur)
@@ -173,6 +175,7 @@ def test_blur_in_one_direction_shows_as_ellipticity(night, solution, exposures):
     assert found.fwhm_ratio == pytest.approx(np.sqrt(wide / SIGMA), rel=0.01)
 
 
+@pytest.mark.slow
 def test_positions_are_those_of_the_mosaic(night, solution):
     shifted = assess(stack(solution, SIGMA, shift=(0.3, -0.4)), solution, fwhm=FWHM)
     assert shifted.position == pytest.approx(0.5 / np.sqrt(2 * np.log(2)), rel=0.01)
@@ -266,6 +269,7 @@ def stacks(night, solution, exposures):
     return compare_stacks(exposures, comparison, mosaic=mosaic, fwhm=FWHM), comparison
 
 
+@pytest.mark.slow
 def test_corrections_sharpen_in_turn(stacks):
     made, _ = stacks
     shift, static, _, method = list(made.qualities.values())[1:]
@@ -277,6 +281,7 @@ def test_corrections_sharpen_in_turn(stacks):
     assert method.position < 0.01
 
 
+@pytest.mark.slow
 def test_zooms_have_their_star_in_the_middle(stacks, solution):
     made, comparison = stacks
     assert len(made.zooms) == 3
@@ -306,6 +311,7 @@ def test_zooms_are_drawn_in_one_stretch(stacks):
     assert "[px]" in axes[-1, 0].get_xlabel()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_report_has_the_stacks(stacks, solution, monkeypatch):
     monkeypatch.setattr(report, "_pictures", lambda *args: {"steps": None, "pairs": []})

@@ -44,6 +44,7 @@ def columns(table, *names):
     return np.column_stack([table[name].value for name in names])
 
 
+@pytest.mark.slow
 def test_with_and_without_a_night_nothing_is_significant(tmp_path, capsys):
     nights = Nights(5, nights=6, per=3, odd=0.5, roll=0.7, n_stars=100, motion=0.05)
     whole, part = (solved(each, motion="proper") for each in (nights.table, nights.table[nights.table["block"] != 3]))
@@ -81,6 +82,7 @@ def test_with_and_without_a_night_nothing_is_significant(tmp_path, capsys):
     assert len(figures["stars"]["largest"]) == 5
 
 
+@pytest.mark.slow
 def test_differences_in_mas_where_the_pixel_scale_is_stated():
     one, two = halves(Nights(5, nights=4, per=3, n_stars=100, motion=0.05), motion="proper", pixel_scale=0.02)
     found = ld.difference(one, two).stars
@@ -129,6 +131,7 @@ def test_years_without_motions_have_no_chance():
     assert found.places.p < 1e-6
 
 
+@pytest.mark.slow
 def test_stars_of_other_names_are_found_by_their_places():
     nights = Nights(3, nights=4, per=3, n_stars=120, roll=0.0)
     other = nights.table.copy()
@@ -141,6 +144,7 @@ def test_stars_of_other_names_are_found_by_their_places():
     assert ld.difference(first, solved(Nights(4, nights=2, per=3, n_stars=120).table)).stars is None  # another field
 
 
+@pytest.mark.slow
 def test_frames_that_were_measured_anew_are_the_same():
     nights = Nights(3, nights=2, per=3, n_stars=100, roll=0.0)
     again = nights.table.copy()
@@ -151,6 +155,7 @@ def test_frames_that_were_measured_anew_are_the_same():
     assert ld.difference(first, solved(again)).shared == ()
 
 
+@pytest.mark.slow
 def test_a_camera_of_nights_knows_which_it_has(tmp_path):
     table = Nights(6, nights=4, per=4, n_stars=100).table
     nights = [solved(table[table["block"] == k]) for k in range(4)]
@@ -176,7 +181,7 @@ def test_stars_are_compared_where_maps_cannot_be():
         found.plot()
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 def test_chances_of_stars_are_even():
     """Halves of eight nights, with motions: squares over those of the errors, and p, which is anything."""
     sets = (Nights(seed, n_stars=120, motion=0.05) for seed in range(8))

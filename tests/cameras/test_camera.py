@@ -357,7 +357,15 @@ class TestSolution:
         assert np.array_equal(fewer.table["x"][rows], matches.table["x"][first])
         assert np.array_equal(matches.table["x_detector"].value, table["x"])
 
-    @pytest.mark.parametrize("known", [{}, {"static_sigma": 0.05}, {"static_sigma": None}, {"static": None}])
+    @pytest.mark.parametrize(
+        "known",
+        [
+            {},
+            pytest.param({"static_sigma": 0.05}, marks=pytest.mark.slow),
+            pytest.param({"static_sigma": None}, marks=pytest.mark.slow),
+            {"static": None},
+        ],
+    )
     def test_one_detector_with_the_identity_is_a_plain_image(self, table, known, tmp_path):
         """To the last bit: its static distortion is the prior, and without one nothing is known."""
         rows = table[table["detector"] == "1"]
@@ -430,6 +438,7 @@ def apart(found, true):
 
 
 class TestFittedCamera:
+    @pytest.mark.slow
     def test_layouts_that_are_wrong_by_10_px(self, gsaoi):
         """Stars at the bound with free layouts, true errors, and the layout as published, after one affine map."""
         night = gsaoi_images.Night(n_stars=470, dither=6.0)
@@ -458,6 +467,7 @@ class TestFittedCamera:
         assert np.isnan(solution.stars["x_err_abs"]).mean() > 0.9
         assert np.isfinite(solution.stars["x_err_known"]).all()
 
+    @pytest.mark.slow
     def test_without_rolls(self, gsaoi):
         """Nothing but the common shear is undetermined by dithers over the gaps alone; the fit converges."""
         night = gsaoi_images.Night(n_exposures=8, n_stars=470, dither=6.0, turn=0.0)
@@ -486,6 +496,7 @@ class TestFittedCamera:
     def _here(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
 
+    @pytest.mark.slow
     def test_detectors_that_share_no_star(self, gsaoi):
         """Without dithers over the gap, and without rolls, nothing tells how the detectors lie: a warning says so."""
         rows = gsaoi_images.Night(n_exposures=6, turn=0.0).table(sigma=SIGMA)
@@ -510,6 +521,7 @@ class TestFittedCamera:
         again = legdistort.Camera.read(solution.camera.write("camera.asdf"))
         assert np.array_equal(again["1"].layout_sigma, solution.camera["1"].layout_sigma)
 
+    @pytest.mark.slow
     @pytest.mark.usefixtures("undrawn")
     def test_errors_of_places(self, gsaoi):
         """Centres and rotations in the printed table scatter by their errors, draw by draw; the report has them."""
@@ -529,6 +541,7 @@ class TestFittedCamera:
         assert "Detectors of camera GSAOI" in page
         assert f"{each[0].x:.4f} ± {each[0].errors[0]:.4f}" in page  # 0.0021
 
+    @pytest.mark.slow
     def test_the_next_night_knows_what_this_one_did_not(self, gsaoi):
         """A camera found without rolls leaves the common shear unknown, also where it is taken as known later."""
         night = gsaoi_images.Night(n_exposures=6, n_stars=350, dither=6.0, turn=0.0)
@@ -541,6 +554,7 @@ class TestFittedCamera:
             assert legdistort.solve(next_night, layout=layout).gauge.unknown_names == ("shear",)
         assert legdistort.solve(legdistort.Matches.from_table(table, camera=gsaoi)).gauge.unknown_names == ()
 
+    @pytest.mark.slow
     def test_a_mismatch_does_not_move_the_camera(self, gsaoi):
         night = gsaoi_images.Night(n_stars=400, dither=6.0)
         table = night.table(sigma=SIGMA)
@@ -829,6 +843,7 @@ class TestFrames:
         (one,) = legdistort.read_exposures(folder / "exp0.fits", ext=("SCI", 1))
         assert (one.name, one.detector) == ("exp0_SCI1", None)
 
+    @pytest.mark.slow
     @pytest.mark.usefixtures("undrawn")
     def test_run_to_mosaic_and_headers(self, frames, tmp_path):
         """Frames to mosaic over the gap, and WCSs in all extensions; stars lie where they are."""
@@ -867,6 +882,7 @@ class TestFrames:
                         series = np.stack([series.ra.deg, series.dec.deg], axis=1)
                         assert np.abs(series - true).max() * 72000 < 1e-5
 
+    @pytest.mark.slow
     def test_step_by_step_no_detector_is_missed(self, frames, tmp_path):
         """Tables name exposures and detectors, their meta data both in one; only what is dark is left out."""
         folder, camera, _ = frames
@@ -895,6 +911,7 @@ class TestFrames:
         assert main(["match", paths[0], "--shape", "100", "100", *out]) == 1
         assert "--shape comes from the camera of the run: leave it out" in capsys.readouterr().err
 
+    @pytest.mark.slow
     def test_one_file_for_every_detector(self, frames, tmp_path):
         """The same table of positions as from files with both."""
         folder, camera, _ = frames
@@ -933,6 +950,7 @@ class TestFrames:
             (e.name, e.exposure, e.detector) for e in known
         ]
 
+    @pytest.mark.slow
     def test_layout_by_headers(self, frames, measured):
         """Without a camera the headers say how the detectors lie; here they know nothing of the distortion."""
         _, camera, _ = frames
@@ -966,7 +984,7 @@ class TestFrames:
             assert words in capsys.readouterr().err
             assert not (tmp_path / "out").exists()
 
-    @pytest.mark.parametrize("known", [True, False])
+    @pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.slow)])
     def test_a_file_with_more_extensions_than_others(self, frames, tmp_path, known):
         """A detector that the camera does not have is named; by headers alone it is one more."""
         folder, camera, _ = frames
@@ -1023,6 +1041,7 @@ class TestExchanged:
         with pytest.raises(InputError, match=words):
             legdistort.solve(matches)
 
+    @pytest.mark.slow
     def test_matching(self):
         """Of detectors alike: all exposures match, and nothing else would tell; others are rightly tied, c and d."""
         rng, size = np.random.default_rng(1), 1000

@@ -58,7 +58,7 @@ def test_the_odd_one_is_found_and_measured_by_the_others(parity):
     assert re.search(words, headers.sentence("the stars put it"))
 
 
-@pytest.mark.parametrize(("n_x", "n_y"), [(2, 2), (3, 3)])
+@pytest.mark.parametrize(("n_x", "n_y"), [(2, 2), pytest.param(3, 3, marks=pytest.mark.slow)])
 def test_errors_of_how_far_it_is_off_are_those_of_drawn_headers(n_x, n_y):
     """Variances of what is stated, over those of what others have wrong, drawn at 1 px and 0.05 degrees."""
     rng, off, stated = np.random.default_rng(5), [], []
@@ -96,8 +96,8 @@ def test_a_layout_that_is_not_known_contradicts_nothing():
     assert ld.Camera.gsaoi().headers is None
 
 
-@pytest.mark.parametrize(("n_x", "n_y"), [(3, 1), (2, 2), (3, 3)])
-@pytest.mark.parametrize("n_sets", [15, pytest.param(150, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("n_x", "n_y"), [(3, 1), (2, 2), pytest.param(3, 3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n_sets", [15, pytest.param(150, marks=pytest.mark.sets)])
 def test_headers_that_are_all_alike_wrong_have_no_odd_one(n_x, n_y, n_sets):
     rng = np.random.default_rng(2)
     odd = [camera(n_x, n_y, rng.normal(0, [5, 5, 0], (n_x * n_y, 3))).headers.odd for _ in range(n_sets)]
@@ -125,6 +125,7 @@ def sky_error(night, solution):
 OPTIONS = {}, {"static": "fit"}, {"layout_sigma": {"shift": 2.0, "rotation": 0.2}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 def test_it_has_no_vote_on_the_sky_whatever_is_fitted(night, matches, options):
     """A quarter of 45 px otherwise; the headers of seven exposures are 3 px off, each."""
@@ -143,6 +144,7 @@ def test_it_has_no_vote_on_the_sky_whatever_is_fitted(night, matches, options):
     assert np.hypot(figures["1"]["header_x_off_px"], figures["1"]["header_y_off_px"]) < 8
 
 
+@pytest.mark.slow
 def test_it_has_none_where_detectors_are_taken_one_by_one(night, matches):
     """With its vote the sky was 12 px off, its scale by 0.35 %: every detector has poses of its own."""
     with pytest.warns(AssumptionWarning, match=r"headers have detector 3 4\d px \(.* agree to .* by those that agree"):
@@ -156,6 +158,7 @@ def test_it_has_none_where_detectors_are_taken_one_by_one(night, matches):
     assert np.degrees(np.angle(factor)) == pytest.approx(0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_it_has_none_where_the_camera_is_given(night, tmp_path):
     """As exact: the headers of the frames are compared with it, and stay with the solution through its file."""
     places = zip(header_layouts.KEYS, night.places, strict=True)
@@ -193,8 +196,8 @@ def test_a_layout_that_is_held_and_wrong_is_the_cause(matches):
     assert {check.cure for check in wrong} == {"see camera first, which is the cause"}
 
 
-@pytest.mark.parametrize("seed", [40, 61])
-@pytest.mark.parametrize("odd", [(22.0, -24.0, 0.0), (0.0, 0.0, 0.0)])
+@pytest.mark.parametrize("seed", [40, pytest.param(61, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("odd", [(22.0, -24.0, 0.0), pytest.param((0.0, 0.0, 0.0), marks=pytest.mark.slow)])
 def test_a_star_or_two_show_it(seed, odd):
     """If all that cross are far off; and what is held, or stated, is then not named as a cure of the few ties."""
     night = header_layouts.Night(seed, off=0.1, dither=36.0, n=6, n_stars=260, odd=odd, size=0.05)
@@ -213,6 +216,7 @@ def test_a_star_or_two_show_it(seed, odd):
     assert ("--layout hold" not in found.cure) == any(odd)
 
 
+@pytest.mark.slow
 def test_static_distortions_cannot_make_up_for_it(matches, monkeypatch):
     """Where they fold in the attempt, it is said what they could not make up for."""
     in_camera, calls = camera_fit.in_camera, []

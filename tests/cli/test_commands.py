@@ -46,7 +46,7 @@ RESULTS = {path.split("/")[0] for path in pipeline.RESULTS} - {"psf", *pipeline.
 @pytest.fixture(scope="module")
 def night(tmp_path_factory):
     folder = tmp_path_factory.mktemp("night")
-    return simulate_exposures(small=True, seed=3).write(folder)
+    return simulate_exposures(small=True, size=320, n_stars=60, seed=3).write(folder)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def run(frames, out, *more):
 def whole(night, tmp_path_factory):
     """The night and a frame without stars run once in the place of other results: folder, what it printed, seconds."""
     folder = tmp_path_factory.mktemp("whole")
-    noise = fits.PrimaryHDU(np.random.default_rng(0).normal(400, 12, (512, 512)).astype("float32"))
+    noise = fits.PrimaryHDU(np.random.default_rng(0).normal(400, 12, (320, 320)).astype("float32"))
     noise.header["GAIN"], noise.header["RDNOISE"] = 2.0, 15.0
     noise.writeto(folder / "empty.fits")
     out = folder / "out"
@@ -223,7 +223,14 @@ def test_wrong_usage_is_told_in_a_line_with_the_nearest_option(capsys, words, me
     assert re.match(message, line)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)])
+@pytest.mark.parametrize(
+    "number",
+    [
+        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
+        signal.SIGTERM,
+        pytest.param(getattr(signal, "SIGHUP", signal.SIGTERM), marks=pytest.mark.slow),
+    ],
+)
 def test_a_stopped_run_leaves_nothing(night, tmp_path, capsys, monkeypatch, number):
     """By Ctrl-C, or by a batch system."""
     (tmp_path / "scratch").mkdir()
@@ -261,6 +268,7 @@ def test_timings_are_what_one_waits_for(whole):
     assert f"start {timings['start']:.2f} s, read" in (whole.out / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_two_workers_leave_the_same(whole, night, tmp_path):
     """In a process of its own, where workers are copies, one of which draws the report while files are written."""
     frames, out = [*night, whole.out.parent / "empty.fits"], tmp_path / "out"
@@ -323,6 +331,7 @@ def test_one_exposure_only(night, tmp_path, capsys):
     failed(capsys, run(night[:1], tmp_path / "out"), "only one exposure", night[0].stem)
 
 
+@pytest.mark.slow
 def test_fewer_stars_than_modes(night, tmp_path, capsys):
     failed(
         capsys, run(night, tmp_path / "out", "--degree", "12"), "stars, fewer than the 91 modes of degree 12", "lower"
@@ -444,6 +453,7 @@ def test_ctrl_c_while_modules_are_imported_is_one_line(name):
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "legdistort: interrupted\n")
 
 
+@pytest.mark.slow
 def test_commands_work_without_any_stream(night, tmp_path):
     """As a daemon has it, and with ``2>&-``: nothing of theirs is written into files, which would take the numbers."""
     out = tmp_path / "d.ecsv"
@@ -454,7 +464,14 @@ def test_commands_work_without_any_stream(night, tmp_path):
     assert len(read_table(out)) > 20
 
 
-@pytest.mark.parametrize("closed", [["stderr"], ["stdout"], ["stdout", "stderr"]])
+@pytest.mark.parametrize(
+    "closed",
+    [
+        pytest.param(["stderr"], marks=pytest.mark.slow),
+        pytest.param(["stdout"], marks=pytest.mark.slow),
+        ["stdout", "stderr"],
+    ],
+)
 def test_main_works_in_programs_without_streams(night, tmp_path, monkeypatch, closed):
     for name in closed:
         monkeypatch.setattr(sys, name, None)
@@ -465,6 +482,7 @@ def test_main_works_in_programs_without_streams(night, tmp_path, monkeypatch, cl
     assert list(map_items(abs, [-1], progress=True)) == [1]
 
 
+@pytest.mark.slow
 def test_a_full_standard_error_is_no_reason_to_fail(night, tmp_path):
     with open("/dev/full", "w") as full:
         command = [sys.executable, "-m", "legdistort", "show", "nowhere"]
@@ -743,6 +761,7 @@ def test_the_ending_of_a_mosaic_is_looked_at_first(demo, tmp_path, capsys, monke
     failed(capsys, main(_coadd(demo, tmp_path / "m.png")), "m.png: the ending selects the format of a mosaic")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_keck_lists_by_the_command_line(shared_data, tmp_path, capsys):
     lists = [str(shared_data / "keck_nirc2_onc_bn" / f"{letter}.lis") for letter in "ABCD"]
@@ -765,12 +784,12 @@ def test_keck_lists_by_the_command_line(shared_data, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_microobservatory_frames(shared_data, tmp_path, capsys):
-    """Six raw, undersampled frames without a WCS, with hot pixels and a drift of 250 px."""
-    frames = sorted((shared_data / "microobs_hatp32" / "frames").glob("*.fits.gz"))[::2]
+    """Four raw, undersampled frames without a WCS, with hot pixels and a drift of 250 px."""
+    frames = sorted((shared_data / "microobs_hatp32" / "frames").glob("*.fits.gz"))[::3]
     how = ["--degree", "2", "--catalogue", "none", "--json", "--quiet"]
     assert main(["run", *map(str, frames), "--out", str(tmp_path / "out"), *how]) == 0
     summary = json.loads(capsys.readouterr().out)
-    assert summary["n_exposures"] == 6
+    assert summary["n_exposures"] == 4
     assert summary["n_stars"] >= 100
     assert summary["left_out"] == {}
     assert summary["fwhm_ratio"] <= 1.25
@@ -796,7 +815,14 @@ def test_steps_keep_the_sky_as_run_finds_it(whole, steps, tmp_path, capsys, monk
     assert "matched without the headers of its frames, so without their sky: " in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("kind", "files"), [("keck-lists", "*.lis"), ("hst-lists", "*.xymq"), ("gwcs", "*.asdf")])
+@pytest.mark.parametrize(
+    ("kind", "files"),
+    [
+        pytest.param("keck-lists", "*.lis", marks=pytest.mark.slow),
+        ("hst-lists", "*.xymq"),
+        pytest.param("gwcs", "*.asdf", marks=pytest.mark.slow),
+    ],
+)
 def test_example_files_are_read_and_stay_the_same(kind, files, tmp_path, capsys):
     assert main(["demo", "--as", kind, "--out", str(tmp_path / "a")]) == 0
     written = sorted(map(Path, capsys.readouterr().out.split()))
@@ -874,7 +900,12 @@ def test_widths_go_with_the_prior_of_headers(night, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("terminal", "more", "shown"), [(True, [], True), (True, ["--quiet"], False), (False, [], False)]
+    ("terminal", "more", "shown"),
+    [
+        (True, [], True),
+        pytest.param(True, ["--quiet"], False, marks=pytest.mark.slow),
+        pytest.param(False, [], False, marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.usefixtures("undrawn")
 def test_writing_shows_a_bar_on_a_terminal(terminal, more, shown, demo, tmp_path, capsys, monkeypatch):
@@ -964,6 +995,7 @@ def test_show_names_the_detector_of_what_it_prints(tmp_path, capsys):
     assert capsys.readouterr().out.startswith("quantity")
 
 
+@pytest.mark.slow
 def test_what_is_said_of_every_image_is_said_of_all(night, demo, tmp_path, capsys, monkeypatch):
     """Of more than a few images a line or two, unless each is asked for."""
     monkeypatch.setattr("legdistort.cli.arguments._MOST_LINES", 2)

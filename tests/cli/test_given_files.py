@@ -33,6 +33,7 @@ def test_exposures_may_be_left_out_by_name(table, tmp_path, capsys):
     assert "--without night* is none of the exposures: exp00, exp01" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_odd_night_is_a_failure_which_its_name_cures(tmp_path, capsys):
     table = Nights(5, per=2, odd=0.5, roll=0.7, n_stars=120).table
     del table["block"]
@@ -54,6 +55,7 @@ def test_an_odd_night_is_a_failure_which_its_name_cures(tmp_path, capsys):
     assert "none of the nights: 2014-05-27, " in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_stated_pixel_scale_gives_figures_in_mas(tmp_path, capsys):
     table = Nights(5, nights=3, per=2, roll=0.7, n_stars=100, motion=0.05).table
     table.write(tmp_path / "m.ecsv")
@@ -120,6 +122,7 @@ def test_cameras_and_priors_are_shown(tmp_path, capsys):
     assert "--strict is for a solution: leave it out" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_shape_of_a_header_comes_from_what_it_is_used_with(table, tmp_path, capsys):
     """A text states none: the table of matches does, and the solution that it is compared with."""
     head = write_head(tmp_path / "a.head", barrel(120), cd=matrix(scale=0.01 / 3600), crpix=(1024.5, 1024.5))

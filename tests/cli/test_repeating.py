@@ -93,6 +93,7 @@ def test_a_file_asks_no_server(flag, text, tmp_path):
     assert getattr(going_on(tmp_path, "--forget", flag[2:]), flag[2:]) is None
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_what_it_was_told(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     simulate_exposures(small=True, n_exposures=4, n_stars=40, seed=1).write("frames")

@@ -10,8 +10,13 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import camera_gaps
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("sensitivity", [(1.0, 1.015, 0.99, 1.01), camera_gaps.SENSITIVITY])
+@pytest.mark.parametrize(
+    "sensitivity",
+    [
+        pytest.param((1.0, 1.015, 0.99, 1.01), marks=pytest.mark.sets),
+        pytest.param(camera_gaps.SENSITIVITY, marks=pytest.mark.slow),
+    ],
+)
 def test_stars_over_the_gaps(tmp_path, sensitivity):
     """On one detector here and on another there: FWHM within 1 % of others', flux steps of 0.5 % at most."""
     found = camera_gaps.groups(*camera_gaps.mosaic_of(tmp_path, sensitivity=sensitivity))

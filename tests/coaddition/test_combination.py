@@ -82,7 +82,9 @@ def test_flags_of_pixels_are_what_mosaics_say():
 
 
 class TestClipping:
-    @pytest.mark.parametrize("k", [4, 6, 11])
+    @pytest.mark.parametrize(
+        "k", [pytest.param(4, marks=pytest.mark.slow), 6, pytest.param(11, marks=pytest.mark.slow)]
+    )
     @pytest.mark.parametrize("known", [True, False])
     @pytest.mark.parametrize(
         "fwhm",
@@ -113,7 +115,9 @@ class TestClipping:
         assert np.abs(aperture(clipped.data, xy, 12) / aperture(mean.data, xy, 12) - 1).max() < 3e-3
 
     @pytest.mark.parametrize(("energy", "least"), [(10, 0.9), (20, 0.95), (100, 0.97), (1000, 0.97)])
-    @pytest.mark.parametrize("k", [4, 6, 11])
+    @pytest.mark.parametrize(
+        "k", [pytest.param(4, marks=pytest.mark.slow), pytest.param(6, marks=pytest.mark.slow), 11]
+    )
     def test_cosmic_rays_on_the_sky_are_found(self, k, energy, least):
         widths = ramp(k, ratio=1.1)
         clean = scene(widths)
@@ -138,7 +142,7 @@ class TestClipping:
         assert np.mean(found) > least
         assert abs(left) < 0.25 * put
 
-    @pytest.mark.parametrize("k", [4, 11])
+    @pytest.mark.parametrize("k", [4, pytest.param(11, marks=pytest.mark.slow)])
     def test_cosmic_rays_on_stars_are_found(self, k):
         widths = np.full(k, 2.5)
 

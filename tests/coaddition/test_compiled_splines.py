@@ -15,7 +15,7 @@ RNG = np.random.default_rng(5)
 
 
 @pytest.mark.parametrize("order", [1, 3])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [pytest.param(np.float32, marks=pytest.mark.slow), np.float64])
 @pytest.mark.parametrize("shape", [(2, 3), (9, 7), (80, 120)])
 def test_values_are_those_of_reproject(order, dtype, shape):
     image = RNG.normal(1000, 300, shape).astype(dtype)
@@ -37,7 +37,15 @@ def test_gain_is_a_product_of_polynomials():
     assert_allclose(compiled_splines.product(series, xy), gain[0] * gain[1], rtol=1e-6)
 
 
-@pytest.mark.parametrize("settings", [{"order": 1}, {"order": 3}, {"order": 3, "weights": "variance"}, {"order": 2}])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        pytest.param({"order": 1}, marks=pytest.mark.slow),
+        {"order": 3},
+        pytest.param({"order": 3, "weights": "variance"}, marks=pytest.mark.slow),
+        pytest.param({"order": 2}, marks=pytest.mark.slow),
+    ],
+)
 def test_the_mosaic_is_the_same(monkeypatch, settings):
     solution, stars, flux = scene(3)
     exposures = [

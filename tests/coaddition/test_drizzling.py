@@ -33,7 +33,7 @@ def test_it_is_the_exact_algorithm():
 
 
 @pytest.mark.parametrize("roll", [0, 2, 45, 137])
-@pytest.mark.parametrize("side", [256, 64])
+@pytest.mark.parametrize("side", [pytest.param(256, marks=pytest.mark.slow), 64])
 def test_bent_blocks_fit_together(monkeypatch, roll, side):
     solution, *_ = scene(1, rolls=(roll,), seed=3)
     y, x = np.indices(SHAPE)
@@ -56,6 +56,7 @@ def test_exposures_together():
     check_stars(mosaic, stars - mosaic.offset, flux, position=0.03, relative=0.005)
 
 
+@pytest.mark.slow
 def test_small_drops_are_sharper():
     solution, stars, flux = scene(8, rolls=range(8), spread=4, peak=5.0)
     exposures = expose(solution, stars, flux)

@@ -148,6 +148,7 @@ class TestFluxScale:
         ):
             CoaddOptions(scale="sky")
 
+    @pytest.mark.slow
     def test_mosaic_through_clouds(self):
         solution, stars, flux, exposures, _ = plain()
         depth = [1.0, 0.6, 0.8, 1.2]
@@ -294,7 +295,7 @@ class TestSaturation:
         scale = {f"frame{i}": 1 / d for i, d in enumerate(depth)}
         return solution, stars, flux * 3, out, scale
 
-    @pytest.mark.parametrize("method", ["mean", "clipped"])
+    @pytest.mark.parametrize("method", [pytest.param("mean", marks=pytest.mark.slow), "clipped"])
     def test_the_short_exposure_fills_the_cores(self, method):
         solution, stars, flux, frames, scale = self.frames()
         mosaic = coadd(frames, solution, scale=scale, method=method, match_background=False)
@@ -335,6 +336,7 @@ class TestSaturation:
 
 
 class TestBackground:
+    @pytest.mark.slow
     def test_gradients_leave_no_steps(self):
         """Skies with one gradient and different levels: flat residuals to less than the noise, whatever overlaps."""
         solution, stars, flux = scene(6, rolls=(0, 1, -1, 2, -2, 1), spread=40)
@@ -360,6 +362,7 @@ class TestBackground:
 
 
 class TestFlux:
+    @pytest.mark.slow
     def test_flux_across_a_field_with_20_px_of_distortion(self):
         """Ours within 0.3 %, beside reproject's own function on the same gwcs, which conserves surface brightness."""
         solution, stars, flux, exposures, together = plain()
@@ -405,8 +408,16 @@ def _turned(solution, scale, angle=0.3):
     return grid
 
 
-@pytest.mark.parametrize("scale", [None, 0.5, 2])
-@pytest.mark.parametrize("settings", [{"order": 1}, {"order": 3}, {"algorithm": "drizzle"}, {"algorithm": "adaptive"}])
+@pytest.mark.parametrize("scale", [None, *(pytest.param(each, marks=pytest.mark.slow) for each in (0.5, 2))])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"order": 1},
+        {"order": 3},
+        pytest.param({"algorithm": "drizzle"}, marks=pytest.mark.slow),
+        pytest.param({"algorithm": "adaptive"}, marks=pytest.mark.slow),
+    ],
+)
 def test_noise_of_sums(settings, scale):
     """NOISECOR is the noise of the sum over a box over what VAR says, whatever the size of the pixels."""
     if settings.get("algorithm") == "drizzle":
@@ -427,11 +438,8 @@ def test_noise_of_sums(settings, scale):
     assert ratio == pytest.approx(mosaic.header["NOISECOR"], rel=0.15 if scale == 0.5 else 0.08)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [{}, *(pytest.param(each, marks=pytest.mark.slow)
-           for each in ({"order": 1, "method": "clipped"}, {"method": "median", "grid": 0.6}))],
-)  # fmt: skip
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", [{}, {"order": 1, "method": "clipped"}, {"method": "median", "grid": 0.6}])
 def test_photons_of_stars_are_in_the_variance_if_the_gain_is_known(settings):
     solution, stars, flux = scene(4, rolls=(0, 2, -3, 5), peak=5.0)
     rng, gain = np.random.default_rng(3), 0.5

@@ -100,6 +100,7 @@ class TestReferencePlane:
         peaks = [m.data[tuple(np.round(xy[covered(mosaic, xy)]).astype(int).T[::-1])] for m in (mosaic, bilinear)]
         assert np.mean(peaks[1] / peaks[0]) < 0.95
 
+    @pytest.mark.slow
     def test_surface_brightness_is_left_alone_on_request(self):
         solution, *_ = plain()
         flat = [Exposure(name, np.full(SHAPE, 7.0)) for name in solution.poses]
@@ -111,6 +112,7 @@ class TestReferencePlane:
         matched = coadd(flat, solution)
         np.testing.assert_allclose(matched.data[seen], 7, rtol=1e-6)  # the sky stays flat
 
+    @pytest.mark.slow
     def test_total_flux_is_the_sum_over_the_detector(self):
         solution, *_ = plain()
         name = "frame0"
@@ -119,7 +121,7 @@ class TestReferencePlane:
             mosaic = coadd([Exposure(name, image)], solution, algorithm=algorithm, match_background=False)
             assert np.nansum(mosaic.data) == pytest.approx(3e4, rel=2e-3), algorithm
 
-    @pytest.mark.parametrize("algorithm", ["adaptive", "exact"])
+    @pytest.mark.parametrize("algorithm", ["adaptive", pytest.param("exact", marks=pytest.mark.slow)])
     def test_other_algorithms(self, algorithm):
         solution, stars, flux, exposures, _ = plain()
         mosaic = coadd(exposures[:1], solution, algorithm=algorithm)
@@ -132,6 +134,7 @@ class TestSky:
         sky = mosaic.wcs.pixel_to_world(*(stars - mosaic.offset).T)
         assert solution.sky.to_sky(stars).separation(sky).max() < 1e-9 * u.deg
 
+    @pytest.mark.slow
     def test_other_grid_through_the_gwcs(self):
         solution, stars, flux, exposures, _ = plain()
         grid = WCS(naxis=2)
@@ -207,7 +210,7 @@ class TestSky:
         edge = [inner[:, [0, -1]].reshape(2, -1), inner[:, :, [0, -1]].reshape(2, -1)]
         np.testing.assert_allclose(along, np.concatenate(edge, axis=1), atol=1e-11)
 
-    @pytest.mark.parametrize("axis", [0, 1])
+    @pytest.mark.parametrize("axis", [pytest.param(0, marks=pytest.mark.slow), 1])
     def test_pieces_know_which_pixels_lie_on_the_detector(self, axis):
         """Also where the distortion, beyond where it is valid, folds back onto the detector, a long and narrow one."""
         shape, far = ((120, 400), 200) if axis else ((400, 120), -200)
@@ -245,7 +248,7 @@ class TestSky:
 
 
 class TestCombination:
-    @pytest.mark.parametrize("method", ["median", "clipped"])
+    @pytest.mark.parametrize("method", [pytest.param("median", marks=pytest.mark.slow), "clipped"])
     def test_hot_pixel_and_trail_are_rejected(self, method):
         solution, stars, flux = scene(4, rolls=(0, 1, -1, 2), spread=5)
         rng = np.random.default_rng(5)
@@ -263,6 +266,7 @@ class TestCombination:
         chosen = covered(mean, xy)
         check_stars(clean, xy, flux, position=0.05, relative=0.03, chosen=chosen)
 
+    @pytest.mark.slow
     def test_clipping_spares_stars_of_different_sharpness(self):
         solution, stars, flux = scene(peak=5.0)
         exposures = expose(solution, stars, flux)
@@ -292,6 +296,7 @@ class TestCombination:
         steps = coadd(raised, solution, match_background=False)
         assert np.abs(steps.data[ok] - mosaic.data[ok]).max() > 10
 
+    @pytest.mark.slow
     def test_variance_is_that_of_the_pixels(self):
         solution, *_ = scene(4, rolls=(0, 1, -1, 2))
         rng = np.random.default_rng(8)
@@ -405,7 +410,15 @@ class TestFile:
         assert np.median(mosaic.variance[mosaic.footprint == 4]) == pytest.approx(0.7, abs=0.3)
         np.testing.assert_allclose(back.uncertainty**2, mosaic.variance, rtol=1e-5)
 
-    @pytest.mark.parametrize("planes", [(), ("UNCERT", "MASK"), ["CONTEXT"], "WEIGHT"])
+    @pytest.mark.parametrize(
+        "planes",
+        [
+            pytest.param((), marks=pytest.mark.slow),
+            ("UNCERT", "MASK"),
+            pytest.param(["CONTEXT"], marks=pytest.mark.slow),
+            pytest.param("WEIGHT", marks=pytest.mark.slow),
+        ],
+    )
     def test_planes_that_are_asked_for(self, planes, tmp_path):
         solution, _, _, exposures, _ = plain()
         mosaic = coadd(exposures, solution, planes=planes)
@@ -486,6 +499,7 @@ class TestFile:
         header["BUNIT"] = unit
         assert replace(mosaic, header=header).to_ccddata().unit == u.dimensionless_unscaled
 
+    @pytest.mark.slow
     def test_times_of_the_exposures(self, tmp_path):
         solution, *_, exposures, _ = plain()
         clocks = [("DATE-OBS", "2024-03-01"), ("TIME-OBS", "22:00:00.5")], [("MJD-OBS", 60371.0)]
@@ -639,6 +653,7 @@ class TestBadInput:
             with pytest.raises(InputError, match=r"must be images as open_exposures .*; give open_exposures"):
                 coadd(given, solution)
 
+    @pytest.mark.slow
     def test_dubious_frames_are_told(self):
         solution, stars, flux = scene(7, rolls=[0] * 7)
         frames = expose(solution, stars, flux, header=fits.Header({"BUNIT": "adu"}))
@@ -661,6 +676,7 @@ class TestBadInput:
         history = str(fits.getheader(tmp_path / "m.fits")["HISTORY"])
         assert "left out n\\xe9: it is not in the solution" in history
 
+    @pytest.mark.slow
     def test_a_coarse_grid_is_for_other_algorithms(self):
         solution, *_, exposures, mosaic = plain()
         grid = mosaic.wcs.deepcopy()

@@ -202,6 +202,7 @@ def test_solutions_with_tables_in_files(solution, tmp_path):
         Solution.read(tmp_path / "s.asdf")
 
 
+@pytest.mark.slow
 def test_wcs_files_with_tables_are_of_stock_models(solution, tmp_path):
     view, p = solution["exp00"], places(beyond=-1.0)
     path = write_wcs(view, tmp_path / "w.asdf")
@@ -223,7 +224,7 @@ def test_wcs_files_with_tables_are_of_stock_models(solution, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda m: m.lookup_table.__imul__(1.05), "misses by"),
+        pytest.param(lambda m: m.lookup_table.__imul__(1.05), "misses by", marks=pytest.mark.slow),
         (lambda m: setattr(m, "method", "nearest"), "should be linear"),
     ],
 )

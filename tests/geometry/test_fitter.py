@@ -71,7 +71,9 @@ def test_is_found_by_astropy():
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("legdistort", "legdistort.solving.estimation", "gwcs")]
 
 
-@pytest.mark.parametrize("first", ["astropy.modeling", "legdistort.geometry.fitter", *SLOW])
+@pytest.mark.parametrize(
+    "first", [pytest.param("astropy.modeling", marks=pytest.mark.slow), "legdistort.geometry.fitter", *SLOW]
+)
 def test_is_found_whatever_is_imported_first(first):
     code = f"import {first}; from astropy.modeling.fitting import LegendreDistortionFitter"
     run = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False)

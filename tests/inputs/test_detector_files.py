@@ -184,9 +184,9 @@ def gwcs_of_asdf(*keys):
 @pytest.mark.parametrize(
     ("ending", "read"),
     [
-        ("cal.fits", gwcs_of_fits),
-        ("model.asdf", gwcs_of_asdf("meta", "wcs")),
-        ("wcs.asdf", gwcs_of_asdf("wcs")),
+        pytest.param("cal.fits", gwcs_of_fits, marks=pytest.mark.slow),
+        pytest.param("model.asdf", gwcs_of_asdf("meta", "wcs"), marks=pytest.mark.slow),
+        pytest.param("wcs.asdf", gwcs_of_asdf("wcs"), marks=pytest.mark.slow),
     ],
     ids=["frames", "models", "bare gwcs"],
 )
@@ -208,6 +208,7 @@ def test_a_visit_by_its_catalogues(ending, read, visit, tmp_path, monkeypatch):
     assert after == pytest.approx(0.01, rel=0.15)
 
 
+@pytest.mark.slow
 def test_catalogues_beside_bare_gwcs(visit, tmp_path, monkeypatch):
     """Files of a gwcs and nothing else: sky and shape of lists, and places to put the refined gwcs into."""
     monkeypatch.chdir(tmp_path)

@@ -83,7 +83,7 @@ def bad_files(folder):
 
 @pytest.fixture(scope="module")
 def night(tmp_path_factory):
-    return ld.simulate_exposures(small=True, seed=3).write(tmp_path_factory.mktemp("night"))
+    return ld.simulate_exposures(small=True, size=320, n_stars=60, seed=3).write(tmp_path_factory.mktemp("night"))
 
 
 def test_bad_files_are_left_out_together(tmp_path, night):
@@ -165,6 +165,7 @@ def test_measure_and_match_leave_bad_files_out(tmp_path, night, capsys):
     assert json.loads(capsys.readouterr().out)["left_out"].keys() >= reasons.keys()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_run_leaves_bad_files_out(tmp_path, night):
     bad, reasons = bad_files(tmp_path)

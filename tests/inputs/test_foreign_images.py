@@ -110,6 +110,7 @@ def test_any_shared_wcs_leads_to_the_sky(kind):
     assert_allclose(to_icrs(found, xy), [expected.ra.deg, expected.dec.deg], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_gwcs_gives_pose_sky_and_distortion():
     """Poses are those that went in; what the header has of distortion is measured."""
     exposures = [
@@ -211,6 +212,7 @@ def test_jwst_cal(jwst, data):
     assert_array_equal(pickle.loads(pickle.dumps(opened)).read().data, data)  # so workers get it
 
 
+@pytest.mark.slow
 def test_jwst_cal_as_a_prior(jwst):
     """Its ASDF extension refers to the arrays of the other HDUs, which are not opened."""
     prior = ld.Prior.from_file(jwst, degree=3)
@@ -255,6 +257,7 @@ def write_roman(path, data, **changes):
     return path
 
 
+@pytest.mark.slow
 def test_roman(data, tmp_path):
     path = write_roman(tmp_path / "r001_wfi07_cal.asdf", data)
     (exposure,) = ld.read_exposures(path)

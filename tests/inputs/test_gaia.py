@@ -175,6 +175,7 @@ def test_a_file_of_that_name_is_a_file(field, home, monkeypatch, tmp_path):
     assert solved(matches, "gaia").diagnostics.reference is not None
 
 
+@pytest.mark.slow
 def test_the_command_takes_the_word(field, home, monkeypatch, tmp_path):
     from legdistort.cli import main
 

@@ -334,7 +334,7 @@ KINDS = st.one_of(
     hnp.unicode_string_dtypes(min_len=1, max_len=4), hnp.byte_string_dtypes(min_len=1, max_len=4),
 )  # fmt: skip
 FUZZ = settings(
-    max_examples=40, deadline=None, derandomize=True, database=None, phases=[Phase.generate],
+    max_examples=20, deadline=None, derandomize=True, database=None, phases=[Phase.generate],
     suppress_health_check=list(HealthCheck),
 )  # fmt: skip
 
@@ -397,6 +397,7 @@ def reads_or_refuses(path):
 # --- in the shell --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_from_lists_to_stars_in_the_shell(tmp_path, capsys):
     """LDAC lists without any option, solved, their checksums in the solution, its stars as FITS."""
@@ -429,6 +430,7 @@ def test_from_lists_to_stars_in_the_shell(tmp_path, capsys):
 # --- what a table of stars says of itself --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_stars_say_what_they_are(tmp_path):
     sim = simulate_gsaoi_matches(small=True, seed=3)
     table = sim.matches.table.copy()

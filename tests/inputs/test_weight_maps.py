@@ -65,6 +65,7 @@ def test_noise_is_that_of_the_map_and_of_the_photons(tmp_path, words, values):
     assert not plain.mask.any()
 
 
+@pytest.mark.slow
 def test_positions_are_better_and_their_errors_true(tmp_path):
     rng, noise = np.random.default_rng(5), stripes((500, 500))
     grid = np.stack(np.meshgrid(np.arange(20, 490, 24), np.arange(20, 490, 24)), axis=-1).reshape(-1, 2)

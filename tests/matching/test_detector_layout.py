@@ -56,6 +56,7 @@ def test_stars_cross(matches, night):
     assert len(number) > 0.9 * np.count_nonzero(np.bincount(star)[star] >= 3)
 
 
+@pytest.mark.slow
 def test_it_can_be_solved(matches, night):
     """The layout to begin with is wrong by pixels and knows no static distortion: both are fitted."""
     solution = legdistort.solve(matches, degree=5, layout="fit", static="fit")

@@ -16,7 +16,9 @@ def matched(night, **known):
     return legdistort.match(night.table, exposures=night.exposures, min_exposures=3, **known)
 
 
-@pytest.mark.parametrize(("seed", "off", "turn", "rolls"), [(2, 10.0, 0.1, (0,)), (3, 5.0, 0.1, (0, 90))])
+@pytest.mark.parametrize(
+    ("seed", "off", "turn", "rolls"), [pytest.param(2, 10.0, 0.1, (0,), marks=pytest.mark.slow), (3, 5.0, 0.1, (0, 90))]
+)
 def test_stars_cross(seed, off, turn, rolls):
     """Nearly all of those that several detectors see, and no two that are not one."""
     night = header_layouts.Night(seed, off=off, turn=turn, rolls=rolls, n=6, n_stars=250)
@@ -25,7 +27,7 @@ def test_stars_cross(seed, off, turn, rolls):
     assert len(true & found) >= 0.98 * len(true)
 
 
-@pytest.mark.parametrize(("seed", "few"), [(45, 5), (53, 6)])
+@pytest.mark.parametrize(("seed", "few"), [(45, 5), pytest.param(53, 6, marks=pytest.mark.slow)])
 def test_few_stars_that_cross_tie_detectors(seed, few):
     """In fewer exposures than are asked for, some flagged at an edge, and with a header that is far off."""
     night = header_layouts.Night(seed, off=1.0, turn=0.05, dither=36.0, n=6, n_stars=260, odd=(22.0, -24.0, 0.6))
@@ -42,7 +44,9 @@ def test_few_stars_that_cross_tie_detectors(seed, few):
     assert np.unique(true[rest], return_counts=True)[1].min() == 4
 
 
-@pytest.mark.parametrize("fluxes", [True, False])
+@pytest.mark.parametrize(
+    "fluxes", [pytest.param(True, marks=pytest.mark.slow), pytest.param(False, marks=pytest.mark.slow)]
+)
 def test_chance_ties_no_detectors(fluxes):
     night = header_layouts.Night(7, off=3.0, dither=9.0, n=5, n_stars=800, odd=(22.0, -24.0, 0.6))
     assert not night.crossing(1)
@@ -53,6 +57,7 @@ def test_chance_ties_no_detectors(fluxes):
     assert len(matches.camera.groups(matches.table)) == 4
 
 
+@pytest.mark.slow
 def test_an_exact_layout_that_is_wrong_is_named():
     """Stars that move over the gaps are found nevertheless; where it is right there is nothing to say."""
     night = header_layouts.Night(4, off=5.0, n=5, n_stars=200)

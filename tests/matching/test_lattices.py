@@ -102,6 +102,7 @@ def test_holes_of_a_mask_are_never_mixed(kind, given, outcome):
     assert tried(3, kind, given) == outcome
 
 
+@pytest.mark.slow
 def test_headers_place_a_mask():
     table, stated = night(5, n_exposures=4, wrong=0.0, stopped=0.0)
     exposures = []

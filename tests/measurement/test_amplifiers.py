@@ -45,7 +45,9 @@ def test_levels_are_found(kind, masked):
     assert np.abs(found - levels(kind)).max() < 8  # the noise of a pixel
 
 
-@pytest.mark.parametrize("curved", [0.0, 100.0, 600.0])
+@pytest.mark.parametrize(
+    "curved", [0.0, pytest.param(100.0, marks=pytest.mark.slow), pytest.param(600.0, marks=pytest.mark.slow)]
+)
 def test_no_levels_where_there_are_none(curved):
     for seed in range(12):
         assert amplifier_levels(frame(seed, curved), np.zeros((SIZE, SIZE), dtype=bool)) is None

@@ -54,7 +54,9 @@ def test_a_gain_that_the_stars_contradict_is_said_without_a_sky():
         measured(exposure(300.0, sky=100.0))
 
 
-@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0, 5.0])
+@pytest.mark.parametrize(
+    "factor", [0.5, pytest.param(1.0, marks=pytest.mark.slow), pytest.param(2.0, marks=pytest.mark.slow), 5.0]
+)
 def test_a_gain_that_may_be_is_not_doubted(factor):
     measured(exposure(factor * GAIN))
     measured(exposure(factor * GAIN, sky=100.0))
@@ -66,7 +68,16 @@ def test_a_known_noise_needs_no_gain():
 
 
 @pytest.mark.parametrize("known", ["gain", "nothing", "uncertainty"])
-@pytest.mark.parametrize("size", [1e-30, 1e-21, 0.1, 1e16, 1e22])
+@pytest.mark.parametrize(
+    "size",
+    [
+        1e-30,
+        pytest.param(1e-21, marks=pytest.mark.slow),
+        pytest.param(0.1, marks=pytest.mark.slow),
+        pytest.param(1e16, marks=pytest.mark.slow),
+        1e22,
+    ],
+)
 def test_a_frame_is_the_same_in_any_unit(size, known):
     """Positions, errors, flags; fluxes are in the unit."""
 
@@ -88,7 +99,17 @@ def test_a_frame_is_the_same_in_any_unit(size, known):
     assert_allclose(found["flags"], right["flags"])
 
 
-@pytest.mark.parametrize("size", [1e-30, 1e-21, 3e-7, 0.7, 1e5, 1e22])
+@pytest.mark.parametrize(
+    "size",
+    [
+        1e-30,
+        pytest.param(1e-21, marks=pytest.mark.slow),
+        pytest.param(3e-7, marks=pytest.mark.slow),
+        0.7,
+        pytest.param(1e5, marks=pytest.mark.slow),
+        pytest.param(1e22, marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize("psf", ["moffat", "effective"])
 def test_single_precision_is_the_same_in_any_unit(size, psf, field):
     """Factors that are no power of two round the pixels, by 6e-8."""
@@ -117,7 +138,9 @@ def field():
     return measured
 
 
-@pytest.mark.parametrize("power", [-70, -3, 60])
+@pytest.mark.parametrize(
+    "power", [-70, pytest.param(-3, marks=pytest.mark.slow), pytest.param(60, marks=pytest.mark.slow)]
+)
 def test_powers_of_two_are_exact_in_single_precision(power):
     one = exposure()
     one = replace(one, data=one.data.astype(np.float32))
@@ -126,6 +149,7 @@ def test_powers_of_two_are_exact_in_single_precision(power):
         assert_allclose(found[name], right[name], rtol=0)
 
 
+@pytest.mark.slow
 def test_errors_put_in_are_the_same_in_any_unit():
     """Noise curves, their fluxes in the unit, and photon noise too."""
     measuring = {"psf": "moffat"}

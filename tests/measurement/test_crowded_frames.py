@@ -74,6 +74,7 @@ def test_pairs_of_half_a_width_are_two_stars(table):
     assert np.all((table["flags"][rows] & Flag.BLENDED) != 0)
 
 
+@pytest.mark.slow
 def test_unit_and_orientation_do_not_matter(field, table):
     turned = ld.measure(exposure(2.5 * field.data.T.copy(), gain=0.4, read_noise=king.READ_NOISE))
     distance, row = cKDTree(places(turned)[:, ::-1]).query(places(table))
@@ -85,6 +86,7 @@ def test_unit_and_orientation_do_not_matter(field, table):
     assert np.mean(np.abs(off) < 0.3 * table["flux_err"][same]) > 0.97
 
 
+@pytest.mark.slow
 def test_true_psf_serves_as_well(field, table):
     given = ld.measure(exposure(field.data), psf=true_psf())
     assert set(given["psf"]) == {"true"}

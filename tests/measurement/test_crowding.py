@@ -80,7 +80,7 @@ def crowded(seed, *, spacing=8.0, size=500):
 
 @pytest.fixture(scope="module")
 def crowd():
-    tables, pulls = zip(*(crowded(seed) for seed in range(5)), strict=True)
+    tables, pulls = zip(*(crowded(seed) for seed in range(2)), strict=True)
     isolated = np.concatenate([is_isolated(table) for table in tables])
     return isolated, np.concatenate(pulls), np.concatenate([table["crowding"] for table in tables])
 
@@ -101,6 +101,7 @@ def test_column_and_flag(crowd):
     assert (crowding > LIMIT).any()
 
 
+@pytest.mark.slow
 def test_unresolved_pairs_are_deformed_and_single_stars_are_not():
     rng = np.random.default_rng(4)
     grid = np.stack(np.meshgrid(*[np.arange(12) * 45 + 30.0] * 2), axis=-1).reshape(-1, 2)
@@ -118,6 +119,7 @@ def test_unresolved_pairs_are_deformed_and_single_stars_are_not():
     assert not is_isolated(table)[deformed].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "least"), [({"elongation": 2.0}, 0.4), ({"coma": 0.4}, 0.9)])
 def test_shapes_that_vary_over_the_field_make_no_star_deformed(shape, least):
     """Behind adaptive optics, images elongated and lopsided off the axis; one star in eight has a companion."""

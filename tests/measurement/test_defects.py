@@ -87,7 +87,7 @@ def clean():
     return table, n_matched(table)
 
 
-@pytest.mark.parametrize("defects", [hits, columns, hot_pixels])
+@pytest.mark.parametrize("defects", [hits, columns, pytest.param(hot_pixels, marks=pytest.mark.slow)])
 def test_defects_cost_no_star_that_they_do_not_touch(defects, clean):
     exposures, added = night(defects)
     table = measure(exposures, psf="moffat")
@@ -101,7 +101,16 @@ def test_defects_cost_no_star_that_they_do_not_touch(defects, clean):
     assert false <= 0.04 * len(rows)
 
 
-@pytest.mark.parametrize("fwhm", [1.2, 1.5, 2.0, 3.0, 5.0])
+@pytest.mark.parametrize(
+    "fwhm",
+    [
+        1.2,
+        pytest.param(1.5, marks=pytest.mark.slow),
+        pytest.param(2.0, marks=pytest.mark.slow),
+        pytest.param(3.0, marks=pytest.mark.slow),
+        5.0,
+    ],
+)
 def test_stars_are_no_defects_however_sharp(fwhm):
     """Neither bright nor faint ones, at no phase of the pixels."""
     exposures, _ = night(fwhm=fwhm, frames=2)
@@ -136,6 +145,7 @@ def test_hot_pixels_are_in_the_table_with_their_flag():
     assert np.all(np.diff(table["flux"]) <= 0)
 
 
+@pytest.mark.slow
 def test_a_star_is_measured_beside_the_defects_on_it():
     """What is hit of it is left out: errors stay true."""
     pulls = []
@@ -183,6 +193,7 @@ def test_what_stays_in_many_exposures():
         assert (table["flags"][:2] == Flag.HOT | Flag.DEFECT).all()
 
 
+@pytest.mark.slow
 def test_a_star_is_none_of_its_own_images_that_persist():
     """For three exposures there is light where it was, ever less; the images are defects, the star is none."""
     xy, flux = stars()
@@ -213,6 +224,7 @@ def test_stars_stay_where_the_sky_does_not_move():
     assert len(usable(table)) > 3 * 45
 
 
+@pytest.mark.slow
 def test_a_mask_that_hides_most_stars_is_named():
     """Of all stars or of most; one of hot pixels hides none."""
     (exposure,), _ = night(frames=1)
@@ -224,7 +236,7 @@ def test_a_mask_that_hides_most_stars_is_named():
     measure(Exposure("e0", exposure.data, added > 0, gain=GAIN, read_noise=READ_NOISE), psf="moffat")
 
 
-@pytest.mark.parametrize("angle", [0, 140])
+@pytest.mark.parametrize("angle", [pytest.param(0, marks=pytest.mark.slow), 140])
 def test_a_trailed_frame_is_named(angle):
     """Stars of 3 pixels drawn out to a length of 9 more."""
     xy, flux = stars()

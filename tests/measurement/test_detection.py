@@ -34,14 +34,19 @@ def found(centres, xy, fwhm):
 
 
 @pytest.fixture(
-    scope="module", params=[{"strehl": 0.1}, {"strehl": 0.3, "halo_fwhm": 12.0}, {"strehl": 0.5, "coma": 0.4}]
+    scope="module",
+    params=[
+        {"strehl": 0.1},
+        pytest.param({"strehl": 0.3, "halo_fwhm": 12.0}, marks=pytest.mark.slow),
+        pytest.param({"strehl": 0.5, "coma": 0.4}, marks=pytest.mark.slow),
+    ],
 )
 def psf(request):
     """Of a pupil, over 512 x 512 px."""
     return as_psf(PupilPSF(resolution=3.5, **request.param), (512, 512))
 
 
-@pytest.mark.parametrize("crowded", [False, True])
+@pytest.mark.parametrize("crowded", [pytest.param(False, marks=pytest.mark.sets), True])
 def test_halos_and_rings_are_no_stars(psf, crowded):
     rng, shape = np.random.default_rng(3), (512, 512)
     xy = rng.uniform(5, 506, (214, 2)) if crowded else scattered(rng, 49, 512)  # one star a (10 FWHM)^2
@@ -60,7 +65,7 @@ def ringed(dx, dy, fwhm):
     return np.exp(-2.77 * r**2) + 0.08 * (1 + np.cos(angle)) * np.exp(-0.5 * ((r - 1.7) / 0.25) ** 2)
 
 
-@pytest.mark.parametrize("companions", [0, 10])
+@pytest.mark.parametrize("companions", [pytest.param(0, marks=pytest.mark.slow), 10])
 def test_side_lobes_of_bright_stars_are_no_stars(companions):
     """The companions put beside some of the stars, twice as bright as the ring, are found."""
     rng, fwhm, size = np.random.default_rng(5), 3.5, 480
@@ -101,6 +106,7 @@ def test_smooth_light_is_exact_on_a_slope_beside_edges_and_gaps():
     assert extrapolated[60 // step, 10] < 1e-3
 
 
+@pytest.mark.slow
 def test_variance_is_that_of_the_sky_in_a_crowded_field_with_halos():
     """The map of `prepare` holds the structure of the halos."""
     rng, size = np.random.default_rng(7), 512
@@ -115,7 +121,9 @@ def test_variance_is_that_of_the_sky_in_a_crowded_field_with_halos():
     assert np.median(unknown.variance / expected) == pytest.approx(1, abs=0.25)
 
 
-@pytest.mark.parametrize("fwhm", [1.4, 8.0, 14.0])
+@pytest.mark.parametrize(
+    "fwhm", [1.4, pytest.param(8.0, marks=pytest.mark.slow), pytest.param(14.0, marks=pytest.mark.slow)]
+)
 def test_narrow_and_wide_stars_are_found_once(fwhm):
     rng = np.random.default_rng(8)
     size = 700 if fwhm > 5 else 300
@@ -127,7 +135,9 @@ def test_narrow_and_wide_stars_are_found_once(fwhm):
     assert len(false) <= 1
 
 
-@pytest.mark.parametrize("saturated", [False, True])
+@pytest.mark.parametrize(
+    "saturated", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.slow)]
+)
 def test_one_width_and_one_position_in_all_cut_outs_of_a_crowded_field(saturated):
     """The same pixels in four frames, undersampled; the brightest stars have flat tops, and no header says so."""
     rng, fwhm, size, part = np.random.default_rng(9), 1.4, 360, 250
@@ -151,6 +161,7 @@ def test_one_width_and_one_position_in_all_cut_outs_of_a_crowded_field(saturated
         assert np.sqrt(np.mean(off**2)) < 0.02
 
 
+@pytest.mark.slow
 def test_a_width_that_no_star_has_is_an_error_within_seconds():
     """Structure of a raw frame, far above the noise and without a star."""
     rng, size = np.random.default_rng(1), 768

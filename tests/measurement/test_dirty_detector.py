@@ -8,8 +8,9 @@ from legdistort.measurement.flags import UNUSABLE, Flag
 from legdistort.measurement.positions import measure
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "seed", [pytest.param(seed, marks=pytest.mark.sets if seed else pytest.mark.slow) for seed in range(6)]
+)
 def test_bright_stars_are_kept(seed):
     """Of 22, of which two are saturated, a clean detector keeps 20, as this one; 16 to 19 when no step was known."""
     night = detector.night(seed)

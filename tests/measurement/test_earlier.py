@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.filterwarnings("ignore::legdistort.LegdistortWarning")
 def night(tmp_path_factory):
     """A folder with frames, and the results of a run at degree 2 in ``first``, with effective PSFs."""
     folder = tmp_path_factory.mktemp("night")
-    paths = legdistort.simulate_exposures(small=True).write(folder / "frames")[:4]
+    paths = legdistort.simulate_exposures(small=True, size=320, n_stars=45).write(folder / "frames")[:4]
     with pytest.MonkeyPatch.context() as undrawn:
         undrawn.setattr("legdistort.reporting.pictures.svg_of", lambda *_, **__: "")
         legdistort.run(paths, out=folder / "first", degree=2, psf="effective")
@@ -48,6 +48,7 @@ def test_the_same_is_the_same(night, tmp_path):
     assert again.solution.provenance["inputs"] == first.provenance["inputs"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unmeasured")
 def test_other_options_and_fewer_frames(night, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

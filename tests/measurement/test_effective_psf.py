@@ -182,6 +182,7 @@ def test_moffat_profiles_would_not_do(made):
     assert rms(best[ratio[star] > THIRDS[2]]) > 1.5
 
 
+@pytest.mark.slow
 def test_the_centre_is_core_weighted(made, psf):
     """The true core-weighted centre, computed from the pupil, is found; that of the pupil's origin is elsewhere."""
     _, xy, _, ratio = night()
@@ -232,6 +233,7 @@ def judged(frame, **options):
     return table, rows, false, [left / np.sqrt(np.einsum("naa->na", c)) for c in (best, own)]
 
 
+@pytest.mark.slow
 def test_a_core_that_moffat_profiles_lack(monkeypatch):
     """A faint core in a narrow halo: bright stars count with their peaks, and faint ones do not take up the sky."""
     monkeypatch.setitem(ao_images.SHAPES, "symmetric", {"halo_fwhm": 10.0})
@@ -247,10 +249,16 @@ def test_a_core_that_moffat_profiles_lack(monkeypatch):
     assert not (table["flags"][bright] & Flag.MASKED).any()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("strehl", "halo", "stars"),
-    [(0.05, 25.0, {}), (0.1, 10.0, {}), (0.6, 10.0, {}), (0.1, 40.0, {}), (0.6, 40.0, {}), (0.3, 25.0, {"n": 12})],
+    [
+        pytest.param(0.05, 25.0, {}, marks=pytest.mark.slow),
+        pytest.param(0.1, 10.0, {}, marks=pytest.mark.sets),
+        pytest.param(0.6, 10.0, {}, marks=pytest.mark.sets),
+        pytest.param(0.1, 40.0, {}, marks=pytest.mark.sets),
+        pytest.param(0.6, 40.0, {}, marks=pytest.mark.sets),
+        pytest.param(0.3, 25.0, {"n": 12}, marks=pytest.mark.sets),
+    ],
 )
 def test_extreme_strehl_ratios_and_halos(monkeypatch, strehl, halo, stars):
     """False stars, positions and errors at the limits: of Strehl ratios, halos, and stars that make a PSF."""
@@ -265,6 +273,7 @@ def test_extreme_strehl_ratios_and_halos(monkeypatch, strehl, halo, stars):
     assert own == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.slow
 def test_errors_grow_where_the_psf_is_wrong(made):
     """A PSF from elsewhere that is not that of the stars: chi2 says so, and errors are larger than with their own."""
     exposure, _, _, _ = night()
@@ -300,6 +309,7 @@ def test_what_all_bright_stars_leave_is_no_noise_of_theirs():
     assert measured(frame.data + companion.astype(np.float32))[1][k].min() > 1.3 * stated[k].max()
 
 
+@pytest.mark.slow
 def test_neighbours_are_fitted_together():
     """Two stars 4 px apart: positions scatter as their errors say, and the pair is not one star."""
     rng = np.random.default_rng(4)
@@ -438,6 +448,7 @@ def test_auto_leaves_moffat_profiles_as_they_are():
         assert np.array_equal(auto[name], moffat[name]), name
 
 
+@pytest.mark.slow
 def test_one_definition_of_the_centre_for_all_exposures():
     """Two exposures behind adaptive optics outvote one that is not; it has an effective PSF too."""
     frames = [night()[0], moffat_exposure(), replace(night()[0], name="another")]
@@ -445,6 +456,7 @@ def test_one_definition_of_the_centre_for_all_exposures():
     assert set(table["psf"]) == {"effective"}
 
 
+@pytest.mark.slow
 def test_too_few_stars_are_measured_with_moffat_profiles_by_name():
     lonely = moffat_exposure(9)
     with pytest.warns(AssumptionWarning, match=r"which needs 12: moffats has [0-9]+; measured with Moffat profiles"):
@@ -491,6 +503,7 @@ def write_psfex(path, ends, **changes):
     table.writeto(path, overwrite=True)
 
 
+@pytest.mark.slow
 def test_psfs_from_elsewhere_measure_as_well(tmp_path, made):
     exposure, xy, covariance, _ = night()
     tables = {}
@@ -532,6 +545,7 @@ def test_written_files_read_back_and_are_read_by_photutils(psf, tmp_path):
     assert ld.measure(night()[0], psf=tmp_path / "grid.fits")["psf"][0] == "array"
 
 
+@pytest.mark.slow
 def test_a_psf_for_every_exposure(psf, tmp_path):
     """A folder or a dict has one for each name; what lacks is an error that says whose."""
     (tmp_path / "out").mkdir()
@@ -617,6 +631,7 @@ def test_options_that_belong_to_moffat_profiles():
 # --- errors by injected stars ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_noise_curve_is_that_of_the_true_psf(made):
     """Stars put in as the effective PSF of the frame, and its halo: errors are at the bound of the pupil's."""
     exposure, xy, _, _ = night()
@@ -635,6 +650,7 @@ def test_noise_curve_is_that_of_the_true_psf(made):
     assert np.mean(ratio) == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.slow
 def test_errors_of_injected_stars_are_true_on_these_images(made, monkeypatch):
     monkeypatch.setattr(injection, "N_FLUXES", 6)
     _, xy, covariance, _ = night()
@@ -663,6 +679,7 @@ def test_picture(psf):
     assert len(plot_psf(psf.named(residual=None), fig=Figure(layout="constrained"))[1]) == 1 + 9
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_the_report_shows_the_psf(psf):
     from legdistort.reporting.page import render
@@ -672,6 +689,7 @@ def test_the_report_shows_the_psf(psf):
     assert "effective PSF" not in render(solution, psfs={})
 
 
+@pytest.mark.slow
 def test_the_command_measures_with_it_and_writes_it(tmp_path, psf):
     from legdistort.cli import main
 

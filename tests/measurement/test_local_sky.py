@@ -20,7 +20,7 @@ def halos():
     """Faint stars among bright ones with halos: positions, image, and the light of the halos at the faint ones."""
     psf, shape, made = as_psf(PupilPSF(strehl=0.3, resolution=3.9), (SIZE, SIZE)), (SIZE, SIZE), []
     centre = render_psf((41, 41), [[20, 20]], [1.0], psf=psf)[20, 20]
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng([24, seed])
         xy, flux = rng.uniform(8, SIZE - 9, (100, 2)), np.append(rng.uniform(3e3, 1.5e4, 70), rng.uniform(3e4, 1e6, 30))
         light = render_psf(shape, xy, flux, psf=psf, sky=SKY)
@@ -29,7 +29,7 @@ def halos():
     return made
 
 
-@pytest.fixture(scope="module", params=["moffat", "effective"])
+@pytest.fixture(scope="module", params=["moffat", pytest.param("effective", marks=pytest.mark.slow)])
 def crowd(request, halos):
     """The faint ones that are isolated: (x - truth) / error, and the light of the halos."""
     pulls, lights = [], []
@@ -48,11 +48,12 @@ def test_faint_stars_on_halos_have_true_errors(crowd):
     """Without slopes of the sky: 1.13 and 1.41 with Moffat profiles, 1.20 and more with the effective PSF."""
     pulls, light = crowd
     for rows in (light < np.median(light), light >= np.median(light)):
-        assert np.count_nonzero(rows) > 80
+        assert np.count_nonzero(rows) > 40
         assert np.std(pulls[rows]) == pytest.approx(1, abs=0.14)
         assert 1.4826 * np.median(np.abs(pulls[rows])) == pytest.approx(1, abs=0.15)
 
 
+@pytest.mark.slow
 def test_errors_grow_with_the_photons_of_the_halo():
     """Stars of one flux on and off a halo: the errors are in the ratio of the noise of the pixels."""
     rng = np.random.default_rng(22)
@@ -73,7 +74,7 @@ def test_errors_grow_with_the_photons_of_the_halo():
     assert ratio > 1.5
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0])
+@pytest.mark.parametrize("factor", [pytest.param(0.5, marks=pytest.mark.slow), 2.0])
 def test_a_wrong_gain_does_not_make_the_sky_noisy(factor):
     """Model wrong: the noise of the sky is seen in the image, whatever the gain says."""
     rng = np.random.default_rng(23)

@@ -22,6 +22,7 @@ from legdistort.simulation.rendering import Moffat, add_noise, render
 
 SKY, GAIN, READ_NOISE = 100.0, 2.0, 10.0
 PSF = Moffat(4.5, 2.8)
+N_POSITIONS = 60  # of every flux of the curves that are looked at
 
 
 def observe(xy, flux, rng, *, size=512, psf=PSF):
@@ -63,7 +64,7 @@ def grid():
 
 @pytest.fixture(scope="module")
 def curves(grid):
-    return ld.calibrate_noise(grid[0], n_positions=150, seed=3)
+    return ld.calibrate_noise(grid[0], n_positions=N_POSITIONS, seed=3)
 
 
 def test_curve_is_the_cramer_rao_bound(curves):
@@ -72,11 +73,11 @@ def test_curve_is_the_cramer_rao_bound(curves):
     bright = (table["flux"] > 3e3) & (table["found"] > 0.97)  # fainter fits are no longer linear
     assert np.count_nonzero(bright) >= 8
     measured = np.sqrt((table["x_rms"].value ** 2 + table["y_rms"].value ** 2) / 2)
-    n = 2 * 150 * np.count_nonzero(bright)
-    # the spread of one level is known to 4 %, the mean over all levels to 1.5 %
+    n = 2 * N_POSITIONS * np.count_nonzero(bright)
+    # the spread of one level is known to 6.5 %, the mean over all levels to 2.3 %
     assert np.sqrt(np.mean((measured / limit)[bright] ** 2)) == pytest.approx(1, abs=0.02 + 2 / np.sqrt(2 * n))
     law = curves.sigma(table["flux"])
-    np.testing.assert_allclose(law[bright], limit[bright], rtol=0.08)
+    np.testing.assert_allclose(law[bright], limit[bright], rtol=0.12)  # two numbers of an axis, from 60 each
 
 
 def test_both_regimes_show(curves):
@@ -96,12 +97,13 @@ def test_errors_stated_by_fits_are_those_that_were_made(curves):
     assert np.mean(ratio) == pytest.approx(1, abs=0.04)
     for axis in "xy":
         bias = (good[f"{axis}_bias"] / good[f"{axis}_sigma"]).value
-        assert np.abs(bias).max() < 4 * 1.25 / np.sqrt(150)
+        assert np.abs(bias).max() < 4 * 1.25 / np.sqrt(N_POSITIONS)
     found = curves.table["found"]
     assert found[0] < 1.0 or curves.table["flux"][0] > 700
     assert (found[3:] > 0.97).all()
 
 
+@pytest.mark.slow
 def test_wide_stars_are_known_less_well():
     widths = [3.5, 4.5, 6.0]
     curves = ld.calibrate_noise(field(2), fwhm=widths, fluxes=[1e4, 1e5], n_positions=60)
@@ -117,14 +119,14 @@ def test_wide_stars_are_known_less_well():
 
 
 def test_seeds_reproduce_and_inputs_stay():
-    exposure = field(3)
+    exposure = field(3, n=12, size=300)
     before = exposure.data.copy()
-    options = {"fluxes": [1e4, 1e5], "n_positions": 30}
+    options = {"fluxes": [1e4, 1e5], "n_positions": 10}
     one, two, other = (ld.calibrate_noise(exposure, seed=seed, **options).table for seed in (5, 5, 6))
     assert (one["x_rms"] == two["x_rms"]).all()
     assert (one["x_rms"] != other["x_rms"]).all()
     np.testing.assert_array_equal(exposure.data, before)
-    both = ld.calibrate_noise([field(1), exposure], seed=5, **options)
+    both = ld.calibrate_noise([field(1, n=12, size=300), exposure], seed=5, **options)
     assert (both.table["x_rms"][both.table["exposure"] == "field3"] == one["x_rms"]).all()  # whoever else is there
 
 
@@ -176,7 +178,7 @@ def test_light_put_in_is_what_was_asked():
     np.testing.assert_allclose(noisy.uncertainty**2, 9 + 0.5 * clean.data, rtol=1e-5)
 
 
-@pytest.mark.parametrize("errors", ["injected", "scaled"])
+@pytest.mark.parametrize("errors", ["injected", pytest.param("scaled", marks=pytest.mark.slow)])
 def test_errors_by_the_curve_are_true(grid, curves, errors):
     exposure, xy = grid
     plain = ld.measure(exposure)
@@ -194,6 +196,7 @@ def test_errors_by_the_curve_are_true(grid, curves, errors):
     assert biweight_scale(((found - xy[nearest]) / error).ravel()) == pytest.approx(1, abs=0.12)
 
 
+@pytest.mark.slow
 def test_measure_takes_its_errors_from_the_curve(tmp_path, monkeypatch):
     monkeypatch.setattr(injection, "N_FLUXES", 4)  # three curves are made, which need only be the same
     exposure = field(7, n=12, size=330, psf=Moffat(2.5, 2.8))
@@ -209,21 +212,22 @@ def test_measure_takes_its_errors_from_the_curve(tmp_path, monkeypatch):
 
 
 def test_missing_gain_is_estimated_and_said():
-    exposure = replace(field(4, n=80), gain=None)
+    exposure = replace(field(4, size=340), gain=None)
     with warns_here(AssumptionWarning, match=r"photon noise of injected stars is estimated .* field4 [12]\.") as said:
-        curves = ld.calibrate_noise(exposure, fluxes=[1e5, 3e5], n_positions=40)
+        curves = ld.calibrate_noise(exposure, fluxes=[1e5, 3e5], n_positions=10)
     assert len(said) == 1
     assert curves.table.meta["photon"]["field4"] == pytest.approx(1 / GAIN, rel=0.3)
-    given = ld.calibrate_noise(exposure, fluxes=[1e5, 3e5], n_positions=40, measuring={"gain": GAIN})
+    given = ld.calibrate_noise(exposure, fluxes=[1e5, 3e5], n_positions=10, measuring={"gain": GAIN})
     assert given.table.meta["photon"]["field4"] == 1 / GAIN
 
 
+@pytest.mark.slow
 def test_uncertainty_plane_tells_the_photon_noise():
-    exposure = field(5)
+    exposure = field(5, n=20, size=340)
     clean = np.maximum(exposure.data, 0)
     with_plane = replace(exposure, gain=None, uncertainty=np.sqrt(clean / GAIN + (READ_NOISE / GAIN) ** 2))
     with warns_here(AssumptionWarning, match="photon noise of injected stars"):
-        curves = ld.calibrate_noise(with_plane, fluxes=[1e5, 3e5], n_positions=30)
+        curves = ld.calibrate_noise(with_plane, fluxes=[1e5, 3e5], n_positions=10)
     assert curves.table.meta["photon"]["field5"] == pytest.approx(1 / GAIN, rel=0.1)
 
 
@@ -243,7 +247,7 @@ def test_uncertainty_plane_tells_the_photon_noise():
 )
 def test_bad_arguments(options, message):
     with pytest.raises(InputError, match=message):
-        ld.calibrate_noise(field(1), **options)
+        ld.calibrate_noise(field(1, n=12, size=300), **options)
 
 
 def test_frames_that_do_not_serve():
@@ -251,7 +255,7 @@ def test_frames_that_do_not_serve():
     empty = Exposure("empty", rng.normal(100, 5, (200, 200)), gain=GAIN)
     with pytest.raises(InputError, match="empty: no star above 5 times the noise shows how wide stars are; give fwhm"):
         ld.calibrate_noise(empty)
-    curves = ld.calibrate_noise(empty, fwhm=4.0, n_positions=20)
+    curves = ld.calibrate_noise(empty, fwhm=4.0, fluxes=[3e3, 1e4, 1e5], n_positions=10)
     assert curves.table.meta["fwhm"] == {"empty": None}
     assert np.isfinite(curves.sigma(1e4))
     with pytest.raises(InputError, match="nor stars that would determine the photon noise; give gain"):
@@ -261,10 +265,10 @@ def test_frames_that_do_not_serve():
     with pytest.raises(InputError, match=r"full: no space for injected stars of FWHM .* px: only \d+ places lie 3"):
         ld.calibrate_noise(full)
     with pytest.raises(InputError, match="field1: stars saturate before they are detected"):
-        ld.calibrate_noise(replace(field(1), saturation=SKY + 25))
+        ld.calibrate_noise(replace(field(1, n=12, size=300), saturation=SKY + 25))
     with pytest.raises(InputError, match="errors must be one of 'fit', 'injected', 'scaled', got 'best'"):
-        ld.measure(field(1), errors="best")
-    faint = ld.calibrate_noise(field(1), fluxes=[20.0, 30.0], n_positions=10)
+        ld.measure(field(1, n=12, size=300), errors="best")
+    faint = ld.calibrate_noise(field(1, n=12, size=300), fluxes=[20.0, 30.0], n_positions=10)
     with pytest.raises(InputError, match="field1: too few injected stars were found for a noise curve; raise fluxes"):
         faint.sigma(1e3)
     with pytest.raises(InputError, match="no noise curve for exposure 'else'; there are field1"):
@@ -282,11 +286,11 @@ def test_picture_has_both_regimes(curves):
 
 
 def test_command(tmp_path, capsys):
-    exposure = field(6)
+    exposure = field(6, n=12, size=300)
     header = fits.Header({"GAIN": GAIN})
     fits.writeto(tmp_path / "a.fits", exposure.data, header)
     out, picture = tmp_path / "noise.ecsv", tmp_path / "noise.png"
-    words = ["noise", str(tmp_path / "a.fits"), "--fwhm", "4", "5", "--n-positions", "20", "--fluxes", "1e4", "1e5"]
+    words = ["noise", str(tmp_path / "a.fits"), "--fwhm", "4", "5", "--n-positions", "10", "--fluxes", "1e4", "1e5"]
     assert parser.main([*words, "--out", str(out), "--plot", str(picture), "--quiet", "--json"]) == 0
     laws = json.loads(capsys.readouterr().out)["laws"]
     assert [law["fwhm"] for law in laws] == [4, 5]
@@ -298,7 +302,7 @@ def test_command(tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.AssumptionWarning")  # the headers tell no gain
 def test_scatter_of_real_stars_follows_the_curve(microobservatory):
     """Twelve real, undersampled, drifting frames: solved, and the scatter of every star beside its curve."""

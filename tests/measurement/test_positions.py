@@ -40,13 +40,16 @@ from legdistort.measurement.profiles import levenberg_marquardt, moffat
 from legdistort.measurement.profiles.blends import group_stars, members
 
 
-@pytest.fixture(scope="module", params=[4.5, 2.0], ids=["fwhm4.5", "fwhm2"])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(4.5, id="fwhm4.5", marks=pytest.mark.slow), pytest.param(2.0, id="fwhm2")],
+)
 def campaign(request):
-    """Five frames of 400 stars of known signal-to-noise ratio, and what was measured."""
+    """Two frames of 400 stars of known signal-to-noise ratio, and what was measured."""
     fwhm, rng = request.param, np.random.default_rng(11)
     ratio, flux, limit = ladder(400, fwhm)
     rows = []
-    for i in range(5):
+    for i in range(2):
         xy, order = scattered(rng, 400, 800), rng.permutation(400)
         frame = observe(image((800, 800), xy, flux[order], fwhm), rng)
         table = usable(measure(Exposure(f"frame{i}", frame, gain=GAIN)))
@@ -68,8 +71,8 @@ def campaign(request):
 def test_positions_reach_the_cramer_rao_bound_with_honest_errors(campaign, low, high):
     rows = campaign[(campaign[:, 0] >= low) & (campaign[:, 0] < high)]
     off, claimed, limit = rows[:, 1:3], rows[:, 3:5], rows[:, 5:7]
-    n = off.size  # about 1000: the rms itself is known to 2.2 %
-    assert n > 800
+    n = off.size  # about 400: the rms itself is known to 3.5 %
+    assert n > 320
     assert np.sqrt(np.mean((off / limit) ** 2)) < 1.05 + 2 / np.sqrt(2 * n)
     assert np.std(off / claimed) == pytest.approx(1, abs=0.05 + 1 / np.sqrt(2 * n))
     assert np.abs(np.mean(off / claimed, axis=0)).max() < 3.5 / np.sqrt(n / 2)
@@ -102,7 +105,19 @@ def test_profile_equals_an_independent_rendering(fwhm):
     assert moffat.fwhm(params)[0] == pytest.approx(fwhm)
 
 
-@pytest.mark.parametrize("fwhm", [1.0, 1.51, 1.91, 2.0, 2.5, 3.01, 3.5, 6.0])
+@pytest.mark.parametrize(
+    "fwhm",
+    [
+        1.0,
+        pytest.param(1.51, marks=pytest.mark.slow),
+        pytest.param(1.91, marks=pytest.mark.slow),
+        2.0,
+        pytest.param(2.5, marks=pytest.mark.slow),
+        pytest.param(3.01, marks=pytest.mark.slow),
+        3.5,
+        pytest.param(6.0, marks=pytest.mark.slow),
+    ],
+)
 def test_no_bias_with_the_phase_of_the_pixels(fwhm):
     """Stars without noise, at a signal-to-noise ratio of 1000: off by less than a tenth of the error."""
     flux = ladder(2, fwhm)[1][-1]
@@ -139,6 +154,7 @@ def faint():
     return {kind: np.concatenate(rows) for kind, rows in out.items()}
 
 
+@pytest.mark.slow
 def test_faint_stars_gain_from_a_shared_shape(faint):
     def rms(kind, column, low, high):
         rows = faint[kind]
@@ -153,6 +169,7 @@ def test_faint_stars_gain_from_a_shared_shape(faint):
             assert rms(kind, slice(3, 5), low, high) == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.slow
 def test_shape_that_varies_over_the_field():
     """Round in the middle, elongated towards the edges: a linear shape leaves the least, and errors stay true."""
     rng = np.random.default_rng(6)
@@ -194,7 +211,9 @@ def test_blends_fitted_together_are_better():
     assert np.all(1.4826 * alone[2:] > 1.3)
 
 
-@pytest.mark.parametrize("blends", ["alone", "together"])
+@pytest.mark.parametrize(
+    "blends", [pytest.param("alone", marks=pytest.mark.slow), pytest.param("together", marks=pytest.mark.slow)]
+)
 def test_isolated_stars_of_a_crowded_field_stay_calibrated(blends):
     """One star every 4 FWHM: those without another one in 3 FWHM, detected or not."""
     rng, fwhm, size, z = np.random.default_rng(14), 3.5, 450, []
@@ -240,6 +259,7 @@ def test_gain_is_found_when_it_is_missing():
     assert np.std(z) == pytest.approx(1, abs=0.08)
 
 
+@pytest.mark.slow
 def test_one_gain_for_all_frames_of_a_camera():
     """Twelve stars a frame: alone each frame says something else, together they say what is nearly true."""
     rng = np.random.default_rng(31)
@@ -413,7 +433,11 @@ FRAMES = {
 }
 
 
-@pytest.mark.parametrize("kind", FRAMES)
+#: What is much like another of them.
+LIKE = ("big-endian integers", "negative sky", "steep sky", "gaps")
+
+
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in LIKE)) for kind in FRAMES])
 def test_frames_as_they_come(field, kind):
     """All kinds: no false star, the errors stay true."""
     xy, clean = field
@@ -527,6 +551,7 @@ def test_exposures_only():
         measure(["frame.fits"])
 
 
+@pytest.mark.slow
 def test_real_frames(shared_data):
     """Undersampled frames of a small telescope: the sky drifts over the detector, hot pixels stay."""
     paths = sorted((shared_data / "microobs_hatp32" / "frames").glob("*.fits.gz"))[::6]

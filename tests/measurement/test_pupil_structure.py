@@ -40,12 +40,14 @@ def test_spots_arms_and_speckles_are_no_stars(frame, found):
     assert (cKDTree(xy).query(frame.xy)[0] < 0.6 * frame.fwhm)[frame.snr > 10].all()
 
 
+@pytest.mark.slow
 def test_stars_whose_tops_are_saturated_have_the_same_structure(frame):
     level = np.sort(frame.data[tuple(np.round(frame.xy).astype(int).T[::-1])])[-3]
     _, xy = measured(frame, saturation=level)
     assert np.count_nonzero(cKDTree(frame.xy).query(xy)[0] > frame.fwhm) <= 3
 
 
+@pytest.mark.slow
 def test_companions_are_found_where_others_have_spots(telescope, frame):
     """A twentieth as bright as a star, at places that differ from star to star."""
     rng, bright = np.random.default_rng(6), np.argsort(-frame.flux)[2:10]

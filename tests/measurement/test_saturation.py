@@ -25,7 +25,7 @@ def field():
     return image, xy, flux, np.array(cut)
 
 
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("known", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_saturated_cores(field, known):
     """With the level of saturation, and without: then the flat tops tell it."""
     image, xy, flux, cut = field

@@ -215,6 +215,7 @@ def test_pictures_are_small():
         assert picture.stat().st_size < 200_000
 
 
+@pytest.mark.slow
 def test_messages_on_the_page_of_messages_are_printed():
     """Each heading is part of a text in the code, between what is put into it."""
     texts = []

@@ -15,7 +15,13 @@ WITHOUT_EXAMPLE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", legdistort.__all__)
+#: What co-adds or measures whole nights.
+LONG = ("Catalogue", "Mosaic", "catalogue", "run", "coadd", "refine", "measure")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in legdistort.__all__]
+)
 def test_examples_do_what_they_show(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     public = getattr(legdistort, name)

@@ -217,6 +217,7 @@ sys.exit(main(["measure", sys.argv[1], "--out", sys.argv[2], "--quiet"]))
 """
 
 
+@pytest.mark.slow
 def test_little_memory_is_told_in_one_line(tmp_path):
     """A header that claims what is allowed but not there, and a limit of the process."""
     path = tmp_path / "claim.fits"

@@ -415,6 +415,7 @@ def test_asdf(alone, tmp_path, kind, root):
             assert "has no business in such a file" in text
 
 
+@pytest.mark.slow
 def test_images_of_roman_go_nowhere(alone, tmp_path):
     path = tmp_path / "r001_cal.asdf"
     image = {"data": np.ones((8, 9), np.float32), "meta": {"exposure": {"exposure_time": 1.0, "start_time": FAR}}}
@@ -423,6 +424,7 @@ def test_images_of_roman_go_nowhere(alone, tmp_path):
     assert exposure.shape == (8, 9)
 
 
+@pytest.mark.slow
 def test_a_wcs_of_the_turning_earth(alone, tmp_path):
     """Frames of the Earth need its rotation, which nobody knows for years to come: no table is fetched."""
     place = CIRS(obstime=FAR, location=EarthLocation.from_geodetic(0, 0))

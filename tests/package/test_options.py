@@ -513,9 +513,13 @@ def assert_complete(function, rows, *subjects):
 
 
 def crossed(pairs, every):
-    """Pairs of options and settings; all but some of each option, each time others, are slow."""
+    """Pairs of options and settings; most of each option, each time others, are slow or sets."""
     return [
-        pytest.param(*pair, marks=[] if k % every == 0 else pytest.mark.slow, id="-".join(map(str, pair)))
+        pytest.param(
+            *pair,
+            marks=[] if k % every == 0 else pytest.mark.slow if k % every == 1 else pytest.mark.sets,
+            id="-".join(map(str, pair)),
+        )
         for k, pair in enumerate(pairs)
     ]
 
@@ -530,7 +534,7 @@ SOLVED_ROWS = [
 ]
 
 
-@pytest.mark.parametrize(("given", "setting"), crossed(SOLVED_ROWS, 2))
+@pytest.mark.parametrize(("given", "setting"), crossed(SOLVED_ROWS, 6))
 def test_solve(given, setting, tmp_path):
     options = {"degree": 1} | resolved(given.options, setting)
     if options["degree"] is None:

@@ -131,7 +131,9 @@ def test_reproject_finds_the_frame(solution, image, target):
 PLACES = {"pole": (0.0, 90.0), "RA 0": (0.0, -30.0), "plain": (140.0, 60.0)}
 
 
-@pytest.fixture(scope="module", params=PLACES)
+@pytest.fixture(
+    scope="module", params=[pytest.param(name, marks=[pytest.mark.slow] * (name != "RA 0")) for name in PLACES]
+)
 def bent(request):
     """A detector with 25 px of distortion, its middle at one of the `PLACES`."""
     lon, lat = PLACES[request.param]

@@ -236,8 +236,9 @@ STACKS = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("stack", STACKS)
+@pytest.mark.parametrize(
+    "stack", [pytest.param(name, marks=pytest.mark.slow if name == "today" else pytest.mark.sets) for name in STACKS]
+)
 def test_files_open_with_gwcs_alone(solution, tmp_path, stack):
     """In a fresh environment with gwcs and what it needs, nothing else: same sky to 1e-9 degrees, same coefficients."""
     python = tmp_path / "venv" / ("Scripts" if os.name == "nt" else "bin") / "python"

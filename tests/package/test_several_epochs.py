@@ -39,6 +39,7 @@ def test_frames_of_several_epochs_show_stars_where_they_are_then():
     assert np.ptp(truth.place("exp05") - truth.positions, axis=0).min() > 5
 
 
+@pytest.mark.slow
 def test_positions_of_such_a_night_give_its_motions():
     sim = simulate_gsaoi_matches(small=True, n_stars=120, motion=0.3, epochs=SIX)
     solution = solve(sim.matches, degree=1, motion="proper", clip=None)
@@ -76,7 +77,9 @@ def test_nights_that_cannot_be(settings, message):
         simulate_exposures(small=True, n_stars=20, **settings)
 
 
-@pytest.mark.parametrize("tied", [False, True])
+@pytest.mark.parametrize(
+    "tied", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.slow)]
+)
 def test_stars_at_another_time_are_those_of_a_solution_of_that_time(tied):
     """As of a solution whose positions are of that time, but for the gauge."""
     sim = field(60, FIVE, parallax=0.1)
@@ -101,6 +104,7 @@ def test_stars_at_another_time_are_those_of_a_solution_of_that_time(tied):
     assert there.meta["epoch"] == 2018.0
 
 
+@pytest.mark.slow
 def test_stars_at_another_time_need_motions():
     with pytest.raises(InputError, match="motions of the stars were not fitted"):
         solve(field(40).matches).stars_at(2018.0)
@@ -133,7 +137,9 @@ def test_a_position_is_carried_along_the_path_of_its_star(moving):
         assert_allclose(a, b)
 
 
-@pytest.mark.parametrize("kind", ["proper", "parallax"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param("proper", marks=pytest.mark.slow), pytest.param("parallax", marks=pytest.mark.slow)]
+)
 def test_errors_of_positions_carried_on_are_calibrated(kind):
     """Fresh measurements in one exposure, carried on by twenty years, after which errors of rates are most of all."""
     pulls, true, stated = [], [], []
@@ -212,6 +218,7 @@ def test_a_table_of_positions_carried_on_in_the_shell(moving, tmp_path):
         solution.correct_table(table, epoch=2021.0)
 
 
+@pytest.mark.slow
 def test_a_stack_of_one_epoch_shows_the_stars_of_that_time():
     """Of the exposures of 2019 alone; where stars are then, not at the epoch of the solution."""
     settings = {"small": True, "n_stars": 80, "motion": 1.5, "epochs": SIX, "dynamic_rms": 0.1}

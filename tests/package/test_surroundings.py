@@ -61,7 +61,7 @@ def whole(out):
 @pytest.mark.parametrize(
     ("locale", "name"),
     [
-        ("C", "with spaces, ünï ☆ 解"),
+        pytest.param("C", "with spaces, ünï ☆ 解", marks=pytest.mark.slow),
         pytest.param("POSIX", "with spaces", marks=pytest.mark.slow),
         pytest.param("C.UTF-8", "plain", marks=pytest.mark.slow),
     ],
@@ -116,7 +116,8 @@ sys.exit(f"{package} can be written")
 """
 
 
-@pytest.mark.parametrize("compiled_from", [10**9, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("compiled_from", [10**9, 1])
 def test_a_package_that_cannot_be_written(table, tmp_path, read_only, compiled_from):
     """Nor is there a home: compiled loops are made without a place to keep them."""
     bare = {
@@ -200,6 +201,7 @@ def test_readers_need_no_permission_to_write(place, solution):
     assert [path.name for path in place.iterdir()] == ["solution.asdf"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_results_that_were_set_aside_are_brought_back_by_the_next_run(table, tmp_path, capsys):
     """Where a process was killed between two renames; they are replaced only if that is asked for."""
@@ -236,6 +238,7 @@ def test_files_of_the_user_in_a_folder_of_results(table, tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["matched.ecsv", "out"]
 
 
+@pytest.mark.slow
 def test_two_commands_at_once(table, tmp_path):
     """One works; the other is told, or finds the results of the first. Neither has a part of the other's."""
     out, environment = tmp_path / "out", os.environ | {"PYTHONPATH": str(ROOT)}
@@ -250,7 +253,7 @@ def test_two_commands_at_once(table, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["matched.ecsv", "out"]
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")  # of threads of other tests, which sleep
 def test_a_solution_in_another_process(solution, method):
     if method not in multiprocessing.get_all_start_methods():

@@ -107,6 +107,7 @@ def test_stars_of_the_solution_keep_their_numbers(solution, found):
     assert list(found.stars["mag"]) == list(25 - 2.5 * np.log10(found.stars["flux"]))
 
 
+@pytest.mark.slow
 def test_a_star_without_a_position_in_the_solution_is_a_new_one(truth, solution, found):
     """All its observations were left out, say."""
     positions = solution.estimate.positions.copy()
@@ -160,6 +161,7 @@ def test_an_image_that_the_solution_left_out_does_not_tell_where_a_star_is(solut
     assert np.all(without["n"] > 4)  # their fluxes count there
 
 
+@pytest.mark.slow
 def test_an_exposure_that_is_not_in_the_solution_is_left_out_by_name(truth, solution):
     few = exposures_of(truth)[:3]
     strange = replace(few[2], name="strange", exposure="strange")
@@ -222,6 +224,7 @@ def test_what_no_exposure_sees_has_no_row(truth, solution):
         ld.catalogue(exposures, solution, positions=Table({"x": place[:, 0], "y": place[:, 1]}))
 
 
+@pytest.mark.slow
 def test_a_hit_on_a_faint_star_is_left_out(truth, solution, found):
     """And a flash of one exposure; a star that brightens in two varies; what one of them alone shows is none."""
     frames = [frame.copy() for frame in truth.frames]
@@ -302,6 +305,7 @@ def test_files_and_command(truth, solution, tmp_path, capsys):
     assert "give the catalogue another" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_pixels_on_the_disk_give_the_same_catalogue(truth, solution, found, tmp_path, monkeypatch):
     """Bit for bit; nothing is left behind."""
     monkeypatch.setattr(ld.photometry.catalogue, "_IN_MEMORY", 0)
@@ -315,7 +319,14 @@ def test_pixels_on_the_disk_give_the_same_catalogue(truth, solution, found, tmp_
         ld.catalogue(exposures_of(truth), solution, scratch=tmp_path / "none")
 
 
-@pytest.mark.parametrize("sides", [{"_BLOCK": 61, "_SMALL": 37}, {"_WORTH": 0}, {"_AROUND": 6.0}])
+@pytest.mark.parametrize(
+    "sides",
+    [
+        pytest.param({"_BLOCK": 61, "_SMALL": 37}, marks=pytest.mark.slow),
+        pytest.param({"_WORTH": 0}, marks=pytest.mark.slow),
+        pytest.param({"_AROUND": 6.0}, marks=pytest.mark.slow),
+    ],
+)
 def test_a_catalogue_does_not_depend_on_the_blocks_that_are_searched(truth, solution, found, monkeypatch, sides):
     """Smaller ones, always all of them, more around what has changed: to a thousandth of an error."""
     for name, value in sides.items():
@@ -326,6 +337,7 @@ def test_a_catalogue_does_not_depend_on_the_blocks_that_are_searched(truth, solu
         np.testing.assert_array_less(np.abs(other.stars[name] - found.stars[name]), 1e-3 * found.stars[f"{name}_err"])
 
 
+@pytest.mark.slow
 def test_fluxes_at_given_places(truth, solution, found):
     """Of stars too faint to be found and of empty sky as their errors state; of bright ones as they are."""
     rng, pixels = np.random.default_rng(5), truth.pixels[0]
@@ -380,6 +392,7 @@ def test_places_that_cannot_be_measured_are_named(truth, solution, tmp_path):
     assert out.stars["n"][0] == 3
 
 
+@pytest.mark.slow
 def test_artificial_stars_are_found_as_stars_are(truth, solution, found, monkeypatch):
     """Faint ones are missed, bright ones not, errors are those stated; the catalogue and its pixels stay."""
     measure, left = ld.photometry.catalogue.measure_completeness, []
@@ -464,6 +477,7 @@ def test_a_sky_made_anew_takes_no_more_of_a_star_that_is_not_seen():
     assert taken[False][-1] > 2 * taken[False][0]
 
 
+@pytest.mark.slow
 def test_artificial_stars_of_the_command(truth, solution, tmp_path, capsys):
     """Tables of two calls with one seed are the same; what stands there is not replaced."""
     paths = written(truth.frames[:3], solution, tmp_path)
@@ -482,6 +496,7 @@ def test_artificial_stars_of_the_command(truth, solution, tmp_path, capsys):
     assert "--seed is for the stars of --artificial" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_run_ends_with_the_catalogue(truth, tmp_path, monkeypatch):
     """That of the solution which it leaves; without one where there can be none, by a warning."""
     paths = []
@@ -555,7 +570,7 @@ def test_memory_does_not_grow_with_the_number_of_exposures(tmp_path):
     assert peaks[1] - peaks[0] < 3 * 24 * 768**2 / 1024  # kB: what three exposures store, of seven more
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 def test_a_deep_field_with_hits_of_particles():
     """Eleven frames, most of whose stars none of them shows, 1 % of the pixels hit."""
     truth = deep_frames(8, size=512, n_stars=600, hit=0.01)
@@ -571,7 +586,7 @@ def test_a_deep_field_with_hits_of_particles():
     assert np.count_nonzero(found.stars["flags"] & Flag.VARIABLE) <= 0.02 * len(found.stars)
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 def test_artificial_stars_tell_the_truth():
     """The part found of them is that found of true stars, and so is the excess of fluxes near the threshold."""
     true, artificial, bias = [], [], []

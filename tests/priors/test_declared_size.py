@@ -78,7 +78,7 @@ def test_larger_size_larger_error_same_relative_positions(declared, sim):
 def test_errors_are_calibrated_for_distortions_of_that_size():
     """Truth drawn as declared: every coefficient of the static distortion 2 px."""
     true, reported = [], []
-    for seed in range(100):
+    for seed in range(50):
         sim = ld.simulate_matches(seed=seed, static=2.0, dynamic=0.3, **SETTING)
         solution = ld.solve(sim.matches, prior=ld.Prior(None, static_sigma=_size(sim.truth.static)))
         good = np.isfinite(solution.estimate.positions[:, 0])
@@ -86,7 +86,7 @@ def test_errors_are_calibrated_for_distortions_of_that_size():
             accuracy.bias(solution.estimate.positions[good], sim.truth.positions[good], removed="similarity") ** 2
         )
         reported.append(accuracy.expected_bias(solution, removed="similarity", absolute=True) ** 2)
-    assert np.mean(true) / np.mean(reported) == pytest.approx(1, abs=0.2)  # standard error 0.06
+    assert np.mean(true) / np.mean(reported) == pytest.approx(1, abs=0.25)  # standard error 0.085
 
 
 def _size(static):
@@ -150,7 +150,9 @@ def test_it_is_no_static_map_to_correct_with(sim, declared):
 
 
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.LegdistortWarning")  # these fit this set badly
-@pytest.mark.parametrize("options", [{"static": "fit"}, {"degree": "auto"}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{"static": "fit"}, pytest.param({"degree": "auto"}, marks=pytest.mark.slow)], ids=str
+)
 def test_with_other_options(sim, options):
     solution = ld.solve(sim.matches, prior=ld.Prior(None, static_sigma=2.0), **options)
     assert solution.gauge.unknown == ()
@@ -184,6 +186,7 @@ def test_it_is_said_once_that_absolute_positions_are_not_known(sim, declared, ca
     assert "Relative error of the correction" in render(free)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_solve_command(sim, tmp_path, capsys):
     table = QTable(sim.matches.table)
@@ -237,6 +240,7 @@ def test_prediction_without_a_prior_is_relative_and_says_so(more):
         assert "no scatter of single exposures was assumed" in str(exact.solution.gauge)
 
 
+@pytest.mark.slow
 def test_predict_command(capsys):
     command = ["predict", "--n-exposures", "8", "--n-stars", "50", "--sigma", "0.02", "--dynamic", "0.3", "--json"]
     assert main([*command, "--quiet"]) == 0

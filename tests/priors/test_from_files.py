@@ -361,6 +361,7 @@ def test_siaf_without_pysiaf(monkeypatch):
 # --- truncation, directions, units ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_truncation_is_true(shared_data, nirc2):
     """Not smaller than by another evaluation on 500 x 500 points, corners included."""
     bump = {"shape": (300, 400), "direction": FORWARD}  # 25 px wide, so that a coarse grid steps over its top
@@ -799,6 +800,7 @@ words = st.sampled_from(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(
     st.dictionaries(keywords, st.one_of(numbers, words), max_size=8), st.sampled_from(["TAN-SIP", "TPV"]), st.booleans()
@@ -827,6 +829,7 @@ trees = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(st.dictionaries(names, trees, max_size=4), st.integers(0, 10**6), st.binary(max_size=3))
 def test_trees_of_any_kind(tmp_path_factory, tree, place, damage):

@@ -138,6 +138,7 @@ def test_the_kind_of_a_distortion_is_named():
     assert describe(header_distortions([Exposure("a", pixels(), wcs=table)])).startswith("look-up tables, up to")
 
 
+@pytest.mark.slow
 def test_headers_that_differ_give_each_its_own():
     small = {key: value if key.endswith("ORDER") else 0.9 * value for key, value in SIP.items()}
     for change, one in ((1e-4, True), (1e-3, False)):  # of 4 pixels, so 0.0004 and 0.004
@@ -151,6 +152,7 @@ def test_headers_that_differ_give_each_its_own():
         ld.Prior.from_headers([exposure(0), exposure(1, sip=small), exposure(2, sip=None)])
 
 
+@pytest.mark.slow
 def test_series_end_at_the_highest_degree_of_sip():
     steep = {"A_ORDER": 9, "B_ORDER": 9, "A_9_0": 5e-18, "B_0_9": 5e-18}
     prior = ld.Prior.from_headers([exposure(0, sip=steep)])
@@ -167,6 +169,7 @@ def test_headers_without_a_distortion():
     assert isinstance(prior, ld.Prior)
 
 
+@pytest.mark.slow
 def test_the_gwcs_beside_an_image_goes_before_its_header(tmp_path):
     table, _ = positions()
     exposures = [exposure(k) for k in range(6)]
@@ -199,6 +202,7 @@ def test_the_size_is_that_over_the_detector():
         assert (told_of([exposure(0, sip=tiny)]) is not None) == told
 
 
+@pytest.mark.slow
 def test_a_distortion_that_is_not_used_is_said():
     table, _ = positions()
     exposures = [exposure(k) for k in range(6)]
@@ -231,7 +235,14 @@ def unused():
     return ld.match(table, exposures=[exposure(k) for k in range(6)], tolerance=8)
 
 
-@pytest.mark.parametrize("road", ["validate", "dropped", "file"])
+@pytest.mark.parametrize(
+    "road",
+    [
+        pytest.param("validate", marks=pytest.mark.slow),
+        pytest.param("dropped", marks=pytest.mark.slow),
+        "file",
+    ],
+)
 def test_a_distortion_that_is_not_used_is_said_on_every_road(road, unused, tmp_path):
     matches, options = unused if road == "dropped" else unused.without({"e5": "by hand"}), {}
     if road == "validate":
@@ -249,6 +260,7 @@ def test_a_distortion_that_is_not_used_is_said_on_every_road(road, unused, tmp_p
     assert state_of(solution) == "warn"
 
 
+@pytest.mark.slow
 def test_commands_one_after_the_other_say_it(tmp_path, sip_night, capsys):
     found, matched, out = (str(tmp_path / name) for name in ("found.ecsv", "matched.ecsv", "out"))
     assert main(["measure", *map(str, sip_night[:4]), "--out", found, "--psf", "moffat", "--quiet"]) == 0
@@ -259,6 +271,7 @@ def test_commands_one_after_the_other_say_it(tmp_path, sip_night, capsys):
     assert state_of(ld.Solution.read(tmp_path / "out" / "solution.asdf")) == "warn"
 
 
+@pytest.mark.slow
 def test_the_sky_is_that_of_the_headers():
     """With their distortion as prior, stars are where the headers say, reference pixel off the centre or not."""
     table, sky = positions()
@@ -272,6 +285,7 @@ def test_the_sky_is_that_of_the_headers():
     assert np.abs(off).max() < 0.02
 
 
+@pytest.mark.slow
 def test_run_takes_the_prior_of_the_headers(tmp_path, night, sip_night, monkeypatch):
     frames, given = sip_night, {}
     monkeypatch.setattr(pipeline, "solve", lambda matches, **options: given.update(options) or pytest.skip("solved"))

@@ -192,6 +192,7 @@ def test_what_no_maps_can_hold(tmp_path, given, message):
 # -- what no series follows
 
 
+@pytest.mark.slow
 def test_a_rough_map_is_not_truncated(mask, rough_prior, tmp_path):
     q = mask.at(4000)
     truth = mask.map(q)
@@ -207,6 +208,7 @@ def test_a_rough_map_is_not_truncated(mask, rough_prior, tmp_path):
     assert_allclose(again.mean, rough_prior.mean, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_solutions_follow_it(mask, rough_prior):
     """Exposures that are known to have this distortion and no more: the residuals are noise."""
     how = {"static": "hold", "exposure_degree": None, "degree": 5}
@@ -228,6 +230,7 @@ def test_solutions_follow_it(mask, rough_prior):
     assert np.std(beyond(corrected - holes, holes, mask.size, 1)) < 1.3 * mask.noise
 
 
+@pytest.mark.slow
 def test_by_exposure(mask, rough_prior):
     """Of priors by exposure every one has the table of its own, as a part of it alone."""
     how = {"static": "hold", "exposure_degree": None, "degree": 5}
@@ -244,6 +247,7 @@ def test_by_exposure(mask, rough_prior):
     assert solution["m1"].distortion.table == prior.table
 
 
+@pytest.mark.slow
 def test_where_a_table_cannot_be(mask, rough_prior):
     with pytest.raises(SolveError, match=r"turbulence cannot be found beside a prior that has a table"):
         mask.solve(prior=rough_prior, terms="turbulence", static=None, exposure_degree=None)
@@ -280,6 +284,7 @@ def test_the_static_of_a_solution_with_its_errors(tmp_path):
     assert_array_equal([fits.getdata(each) for each in write_maps(known, tmp_path / "t.fits", solution=solution)], maps)
 
 
+@pytest.mark.slow
 def test_the_map_of_one_detector_of_a_camera(tmp_path, capsys):
     """Of a solution and of its camera in a file, by the id; without one it is refused (it was a map of zeros)."""
     night = ld.solve(four_detectors.matches("static", 1), static="fit", layout="fit", degree=2)

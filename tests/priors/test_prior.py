@@ -69,7 +69,7 @@ def test_origin_and_model_forms_agree(detector):
     assert np.abs(slipped.mean - one.mean).max() > 1e-4
 
 
-@pytest.mark.parametrize(("detector", "origin"), [(2, 0), (4, 1)])
+@pytest.mark.parametrize(("detector", "origin"), [pytest.param(2, 0, marks=pytest.mark.slow), (4, 1)])
 def test_both_directions_give_the_same_prior(detector, origin):
     """The other direction is served by Newton's method on the published polynomials."""
     forward = published(detector)

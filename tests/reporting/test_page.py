@@ -265,6 +265,7 @@ def test_outlying_exposures_are_marked(tables_only):
     assert marked == [Page(text).row(solution.names[3])[7]]
 
 
+@pytest.mark.slow
 def test_trailed_exposures_have_a_row_and_are_marked(solution, tables_only):
     """Three times as long as wide is an ellipticity of 2/3; where no star was measured nothing is stated."""
     names = solution.names
@@ -279,7 +280,9 @@ def test_trailed_exposures_have_a_row_and_are_marked(solution, tables_only):
     assert "trailed" not in report.render(solution)
 
 
-@pytest.mark.parametrize("degree", [1, 2, 6])
+@pytest.mark.parametrize(
+    "degree", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(6, marks=pytest.mark.slow)]
+)
 def test_two_exposures_without_flux_prior_or_mosaic(degree):
     solution = make_solution(2, 30, degree, flux=False, prior=False)
     page = Page(report.render(solution))
@@ -295,6 +298,7 @@ def test_strong_distortion_is_magnified_less():
     assert "magnified 2 times" in text
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_many_exposures_are_listed_and_the_dozen_that_departs_most_is_drawn():
     solution = make_solution(14, 10)
@@ -353,6 +357,7 @@ def test_nothing_is_left_behind_when_it_fails(tmp_path, solution, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_solved_set_gives_a_page(tmp_path):
     matches = observations.simulate_matches(n_stars=25, n_exposures=3, degree=2, seed=3).matches
     solution = solve(matches, degree=2)

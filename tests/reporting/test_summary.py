@@ -74,6 +74,7 @@ def test_every_exposure_is_in_figures():
     assert found["detectors"] == []
 
 
+@pytest.mark.slow
 def test_a_night_has_what_its_exposures_have_in_common():
     """One night is 3 px off a mode: that is its figure, and none of the others have a part of it."""
     table = Nights(2, nights=7, per=3, n_stars=120, odd=3.0, roll=0.0).table
@@ -102,6 +103,7 @@ def test_every_detector_is_in_figures():
     assert all(each["x_err_px"] > 0 for each in found["detectors"])
 
 
+@pytest.mark.slow
 def test_a_map_that_folds_costs_its_image_alone(tmp_path):
     """Named in summary and check; the others have their WCS, and are co-added."""
     night = simulate_exposures(small=True, n_exposures=4, seed=1)

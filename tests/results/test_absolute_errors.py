@@ -72,7 +72,7 @@ def test_known_offsets_are_those_after_a_similarity_where_all_is_known():
     assert np.sqrt(np.mean(accuracy.known_offsets(solution, true) ** 2)) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(("prior", "least"), [("none", 1.05), ("exact", 0.8)])
+@pytest.mark.parametrize(("prior", "least"), [pytest.param("none", 1.05, marks=pytest.mark.slow), ("exact", 0.8)])
 def test_relative_errors_are_calibrated_after_any_common_map(prior, least):
     """Positions good to 0.003 px; without a prior the solution is pixels off, and a linear map is not enough."""
     after, linear = [], []
@@ -95,6 +95,7 @@ def few_undithered(n_stars, seed, **setting):
     return solution, sky[solution.estimate.star_names]
 
 
+@pytest.mark.slow
 def test_relative_errors_of_few_stars_are_those_after_what_nothing_determines():
     squares = np.zeros(2)
     for seed in range(8):

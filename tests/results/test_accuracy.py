@@ -62,7 +62,14 @@ def runs():
 
 
 @pytest.mark.parametrize(
-    ("make", "removed"), [(paper, None), (paper, "similarity"), (paper, 3), (turned, 2), (gsaoi, 3)]
+    ("make", "removed"),
+    [
+        (paper, None),
+        (paper, "similarity"),
+        (paper, 3),
+        pytest.param(turned, 2, marks=pytest.mark.slow),
+        pytest.param(gsaoi, 3, marks=pytest.mark.slow),
+    ],
 )
 def test_relative_bias_is_the_one_expected(runs, make, removed):
     """Undithered exposures of zero mean are in the gauge as they come; elsewhere the common map is taken out."""
@@ -74,7 +81,9 @@ def test_relative_bias_is_the_one_expected(runs, make, removed):
     assert_agrees(pairs, slack=0.03)
 
 
-@pytest.mark.parametrize("make", [paper, turned, gsaoi])
+@pytest.mark.parametrize(
+    "make", [paper, pytest.param(turned, marks=pytest.mark.slow), pytest.param(gsaoi, marks=pytest.mark.slow)]
+)
 def test_scatter_of_new_positions_is_the_one_expected(runs, make):
     sigma, pairs = 0.05, []
     for seed, (sim, solution) in zip(SEEDS, runs(make), strict=True):
@@ -203,6 +212,7 @@ def test_scatter_is_the_papers():
     assert_allclose(out[2], np.sqrt(np.delete(c[:, 2], 3, axis=0).var(axis=0).sum() / 2))
 
 
+@pytest.mark.slow
 def test_corrected_positions_stand_where_they_belong(runs):
     _, solution = runs(gsaoi)[0]
     corrected = accuracy.corrected_positions(solution)

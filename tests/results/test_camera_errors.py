@@ -102,6 +102,7 @@ def relative(dense, solution):
     return take_off @ dense.by_layouts() @ take_off.T
 
 
+@pytest.mark.slow
 def test_coefficients(solution, dense, relative):
     """The covariance of every exposure is that of a known camera, and what the layouts add."""
     for i, name in enumerate(solution.names):
@@ -113,6 +114,7 @@ def test_coefficients(solution, dense, relative):
         assert np.trace(expected) > np.trace(known)  # it is not little
 
 
+@pytest.mark.slow
 def test_stars(solution, dense, relative):
     n = 2 * dense.n_stars
     matrix = solution.estimate.uncertainty.star_matrix.reshape(2, dense.n_stars, 2, dense.n_stars)

@@ -142,12 +142,14 @@ def check(path, read, use, monkeypatch, module, n):
 
 
 SOME_OR_MANY = pytest.mark.parametrize(
-    "n", [pytest.param(4, id="some"), pytest.param(30, id="many", marks=pytest.mark.slow)]
+    "n", [pytest.param(4, id="some"), pytest.param(30, id="many", marks=pytest.mark.sets)]
 )
 
 
 @SOME_OR_MANY
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(each, marks=[pytest.mark.slow] * (each in ("tied", "camera"))) for each in KINDS]
+)
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.LegdistortWarning")  # these sets tell little
 def test_solutions(kind, n, tmp_path, monkeypatch):
     path = KINDS[kind]().write(tmp_path / "s.asdf")

@@ -76,7 +76,13 @@ def pulls(solution, table, sky):
 
 @pytest.mark.parametrize(
     ("errors", "without"),
-    [("floor", 2.3), ("stated", 2.3), ("scale", 1.8), ("by-brightness", 0.18), ("correlated", 2.4)],
+    [
+        ("floor", 2.3),
+        ("stated", 2.3),
+        ("scale", 1.8),
+        ("by-brightness", 0.18),
+        pytest.param("correlated", 2.4, marks=pytest.mark.slow),
+    ],
 )
 def test_errors_of_new_positions_are_true(errors, without):
     """Of stars that are not in the fit, in either axis; with the stated errors alone they are wrong."""

@@ -179,7 +179,7 @@ def test_a_worthless_exposure_changes_no_error():
         assert_allclose(errors[-1], without.stars["x_err"], rtol=0.01)
 
 
-@pytest.mark.parametrize("n", [4, 6])
+@pytest.mark.parametrize("n", [4, pytest.param(6, marks=pytest.mark.slow)])
 def test_relative_errors_without_a_prior_hold_for_few_exposures(n):
     """Truth of Chebyshev polynomials; 0.72 and 0.86 in the gauge of what dithers determine."""
     relative, _ = new_positions_table.row("no prior, 0.02 px", 8, n_exposures=n)
@@ -405,9 +405,13 @@ def test_files_keep_what_is_needed(solution, tmp_path):
 # -- are they true?
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["prior, exact, 0.02 px", "prior, exact, 0.003 px", "prior with static_sigma, 0.02 px"]
+    "name",
+    [
+        pytest.param("prior, exact, 0.02 px", marks=pytest.mark.sets),
+        pytest.param("prior, exact, 0.003 px", marks=pytest.mark.slow),
+        pytest.param("prior with static_sigma, 0.02 px", marks=pytest.mark.sets),
+    ],
 )
 def test_errors_are_calibrated(name):
     """Truth of Chebyshev polynomials; relative after a cubic map, absolute after the similarity of the stars."""

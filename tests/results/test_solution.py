@@ -109,7 +109,26 @@ PRODUCERS = {
 }
 
 
-@pytest.fixture(scope="module", params=PRODUCERS)
+#: Neighbours of the others.
+SLOW = {
+    "widths found at degree 1",
+    "widths found at degree 0",
+    "tied to one star",
+    "degree chosen",
+    "validated",
+    "errors scaled",
+    "robust",
+    "published",
+    "shifts",
+    "relative to one exposure",
+    "predicted without scatter",
+    "predicted with widths",
+}
+
+
+@pytest.fixture(
+    scope="module", params=[pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in PRODUCERS]
+)
 def produced(request):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LegdistortWarning)  # some of the sets tell little
@@ -228,8 +247,15 @@ def assert_survives(solution, remake):
     assert repr(again) == repr(filled)
 
 
-@pytest.mark.parametrize("remake", [lambda s: pickle.loads(pickle.dumps(s)), copy.copy, copy.deepcopy])
-@pytest.mark.parametrize("what", ["motions", "model"])
+@pytest.mark.parametrize(
+    "remake",
+    [
+        lambda s: pickle.loads(pickle.dumps(s)),
+        pytest.param(copy.copy, marks=pytest.mark.slow),
+        pytest.param(copy.deepcopy, marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.parametrize("what", ["motions", pytest.param("model", marks=pytest.mark.slow)])
 def test_copies(what, remake):
     solution = solve(moving_stars.field(60).matches, motion="proper") if what == "motions" else PRODUCERS["model"]()
     assert_survives(solution, remake)
@@ -254,6 +280,7 @@ def test_names_are_printed_whole():
     assert len({len(row) for row in rows}) == 1
 
 
+@pytest.mark.slow
 def test_size_of_a_pickle():
     """Of 24,000 positions in 60 exposures; equations stay behind, and what was made from the solution."""
     matches = simulate_matches(n_exposures=60, n_stars=400, degree=1, seed=1).matches

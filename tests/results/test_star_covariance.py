@@ -72,6 +72,7 @@ def test_what_was_left_out_does_not_count(tmp_path):
     assert accuracy.expected_bias(read_back(fresh, tmp_path), removed=2) == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_what_is_not_in_the_table_is_refused(tmp_path):
     fresh = solve(SIM.matches, degree=2, loss="cauchy")
     back = read_back(fresh, tmp_path)

@@ -124,6 +124,7 @@ def test_what_residuals_determine_is_left_to_them(monkeypatch, method):
     assert b == pytest.approx(bound, rel=0.25)
 
 
+@pytest.mark.slow
 def test_understated_errors_do_not_contradict_the_convention():
     """At the observed scale the convention stands, whatever the stated errors claim."""
     sim = simulate_matches(seed=2, sigma=0.1, dither=250.0, n_stars=60)
@@ -136,7 +137,9 @@ def test_understated_errors_do_not_contradict_the_convention():
     assert solution.gauge.released is None
 
 
-@pytest.mark.parametrize("seeing", [{"dither": 50.0, "dynamic": 0.01}, {"dither": 0.0, "dynamic": 0.1}])
+@pytest.mark.parametrize(
+    "seeing", [pytest.param({"dither": 50.0, "dynamic": 0.01}, marks=pytest.mark.slow), {"dither": 0.0, "dynamic": 0.1}]
+)
 def test_a_large_static_distortion_is_no_misfit(seeing):
     """10 px in all exposures, 0.1 to 1.5 px in which they differ, positions good to 0.01 px."""
     solution = solve(simulate_matches(seed=1, sigma=0.01, static=10.0, n_stars=300, **seeing).matches)
@@ -170,7 +173,7 @@ def test_what_residuals_hardly_determine_stays_with_the_convention(monkeypatch, 
     assert rms_distortion(solution) < 0.2  # 0.15 of the truth, plus noise
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 def test_real_frames_of_one_telescope_have_one_scale(microobservatory):
     """Similarities between these frames leave 0.1 to 0.2 px, and their scales agree to 0.0005."""
     exposures, detections = microobservatory
@@ -229,6 +232,7 @@ def _with_mismatches(seed, fraction):
     return sim, table, wrong
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.* no position, the observations contradict one another")
 def test_gross_mismatches_cost_nothing():
     """10 % of the positions off by up to 50 px: within 5 % of the data with these taken out by hand."""
@@ -267,6 +271,7 @@ def test_mismatched_exposure_is_named_and_moves_nobody(known_poses):
     assert np.all(np.abs(solution.coefficients - clean.coefficients) < error)
 
 
+@pytest.mark.slow
 def test_one_noisy_exposure_does_not_blur_the_others():
     """One of ten exposures with 100 x the errors costs what its data are worth, not more than 10 % beyond."""
     b, b_without = [], []

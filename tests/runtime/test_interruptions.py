@@ -651,6 +651,7 @@ def races(folder):
         assert [path.name for path in out.parent.iterdir()] == ["out"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
 def test_two_writers_at_once_are_one_after_the_other(tmp_path):
     # forked from a small process without threads
@@ -832,14 +833,14 @@ def test_the_disk_is_asked(tmp_path):
 # --- killed at every step -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="kills.py is for Linux")
-def test_kills():
-    """See `kills.py`: thirteen calls, four kills."""
+@pytest.mark.parametrize("n", [pytest.param(1, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.sets)])
+def test_kills(n):
+    """See `kills.py`: thirteen calls, each killed n times."""
     run = subprocess.run(
-        [sys.executable, HERE / "kills.py", "--kills", "4"], capture_output=True, text=True, check=False
+        [sys.executable, HERE / "kills.py", "--kills", str(n)], capture_output=True, text=True, check=False
     )
     assert run.returncode == 0, run.stdout + run.stderr
     all_of_them = run.stdout.splitlines()[-1].split()
     assert all_of_them[0] == "all"
-    assert all_of_them[2] == "4"
+    assert all_of_them[2] == str(n)

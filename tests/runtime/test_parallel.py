@@ -133,15 +133,18 @@ class TestEach:
             ):
                 list(results)
 
+    @pytest.mark.slow
     def test_a_worker_of_another_version_is_told(self, client, monkeypatch):
         monkeypatch.setattr(parallel, "version", lambda name: "0.0.1")
         with pytest.raises(LegdistortError, match=r"have legdistort [\d.]+, here it is 0\.0\.1: install the same"):
             list(map_items(abs, [1]))
 
+    @pytest.mark.slow
     def test_errors_of_the_work_come_as_they_are_from_a_cluster(self, client):
         with pytest.raises(FileNotFoundError, match="nowhere"):
             list(map_items(open, ["/nowhere"]))
 
+    @pytest.mark.slow
     def test_the_client_of_the_caller_is_used(self, client):
         assert set(map_items(_process, range(8))) == set(client.run(os.getpid).values())
         assert set(map_items(_process, range(8), workers=1)) == {os.getpid()}
@@ -211,6 +214,7 @@ class TestCopies:
         """
         assert in_a_new_process(script) == "False\n"
 
+    @pytest.mark.slow
     def test_a_function_beside_a_block(self, tmp_path):
         """It is at work while the block runs, its files stay, what it warns of and raises arrives."""
         script = """if True:
@@ -544,8 +548,8 @@ class TestMosaicInBlocks:
         [
             {"order": 3, "method": "clipped"},
             {"order": 1},
-            {"order": 5, "method": "median"},
-            {"algorithm": "adaptive"},
+            pytest.param({"order": 5, "method": "median"}, marks=pytest.mark.slow),
+            pytest.param({"algorithm": "adaptive"}, marks=pytest.mark.slow),
             {"algorithm": "drizzle"},
             pytest.param({"algorithm": "exact"}, marks=pytest.mark.slow),
         ],
@@ -568,6 +572,7 @@ class TestMosaicInBlocks:
         # found in a table of 256 fractions of a pixel, so rounding may take its neighbour
         np.testing.assert_allclose(pieces.variance, whole.variance, rtol=0.02)
 
+    @pytest.mark.slow
     @COMPILED
     def test_any_number_of_workers_gives_the_same_bits(self, client, monkeypatch, tmp_path, compiled_from):
         solution, exposures = night(uncertainty=np.full(SHAPE, 8.0))
@@ -579,7 +584,9 @@ class TestMosaicInBlocks:
             assert_same(ld.coadd(exposures, solution, workers=workers, **settings), one)
         assert not any(tmp_path.iterdir())
 
-    @pytest.mark.parametrize("method", ["mean", "clipped"])
+    @pytest.mark.parametrize(
+        "method", [pytest.param("mean", marks=pytest.mark.slow), pytest.param("clipped", marks=pytest.mark.slow)]
+    )
     def test_drizzle_in_processes_gives_the_same_bits(self, monkeypatch, method):
         pytest.importorskip("drizzle")
         solution, exposures = night(uncertainty=np.full(SHAPE, 8.0))
@@ -618,6 +625,7 @@ class TestMosaicInBlocks:
         for plane in (mosaic.weight, mosaic.flags, *mosaic.context):
             assert not plane[empty].any()
 
+    @pytest.mark.slow
     def test_the_context_says_who_contributes(self):
         solution, exposures = night(34)
         mosaic = ld.coadd(exposures, solution, order=1)

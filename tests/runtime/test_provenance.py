@@ -96,6 +96,7 @@ def test_a_frame_that_changes_while_it_is_read(pair, monkeypatch, swap, reading)
         ld.open_exposures(pair[0]) if reading == "first" else handle.read()
 
 
+@pytest.mark.slow
 def test_a_run_whose_frame_is_swapped_leaves_nothing(tmp_path, monkeypatch):
     """The new frame has the shape of the old one, and would have passed for it."""
     paths = simulate_exposures(small=True, seed=3).write(tmp_path / "frames")
@@ -245,7 +246,7 @@ while True:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="folders are exchanged in one step there alone")
-@pytest.mark.parametrize("n_reads", [300, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n_reads", [100, pytest.param(10_000, marks=pytest.mark.sets)])
 def test_readers_beside_a_writer(tmp_path, n_reads):
     """At 24 commits a second: never files of two runs, and never a folder that is missing.
 

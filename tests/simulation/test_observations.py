@@ -110,6 +110,7 @@ def test_default_is_simulation_one():
     assert repr(truth) == "<Truth: 30 stars, 10 exposures, 10 modes>"
 
 
+@pytest.mark.slow
 def test_coefficients_have_the_stated_spread():
     sims = [simulate_matches(seed=k, zero_mean=False) for k in range(40)]
     assert np.std([s.truth.static for s in sims]) == pytest.approx(1.5, rel=0.08)
@@ -271,6 +272,7 @@ def test_night_positions_are_static_then_dynamic():
     assert 15 < np.abs(xy - q).max() < 60
 
 
+@pytest.mark.slow
 def test_images_and_catalogue_are_twins(small):
     twin = simulate_gsaoi_matches(small=True, seed=1)
     np.testing.assert_array_equal(small.truth.positions, twin.truth.positions)
@@ -353,6 +355,7 @@ def test_written_files_are_read_as_exposures(small, tmp_path):
     assert table["ra"].unit == "deg"
 
 
+@pytest.mark.slow
 def test_unknown_setting_is_named():
     with pytest.raises(InputError, match="unknown setting 'dithers'; a night has n_exposures"):
         simulate_exposures(dithers=3)

@@ -55,24 +55,23 @@ def assert_agrees(n_im, n_star, sigma, n, *, tolerance, accuracy):
     assert_allclose([prediction.b, prediction.sigma] / measured, 1, atol=tolerance)
 
 
-@pytest.mark.parametrize(("n_im", "n_star", "n"), [(10, 30, 20), (2, 40, 30)])
+@pytest.mark.parametrize(("n_im", "n_star", "n"), [pytest.param(10, 30, 20, marks=pytest.mark.slow), (2, 40, 30)])
 def test_agrees_with_monte_carlo(n_im, n_star, n):
     assert_agrees(n_im, n_star, 0.14, n, tolerance=0.06, accuracy=0.025)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n_im", "n_star", "sigma", "n"),
     [
-        (10, 30, 0.14, 120),  # Simulation 1
-        (10, 30, 0.03, 120),  # Simulation 2, its smallest and largest noise
-        (10, 30, 0.28, 120),
-        (2, 30, 0.14, 200),  # Simulation 3
-        (50, 30, 0.14, 130),
-        (100, 30, 0.14, 130),
-        (10, 20, 0.14, 200),  # Simulation 4
-        (10, 100, 0.14, 60),
-        (10, 200, 0.14, 60),
+        pytest.param(10, 30, 0.14, 120, marks=pytest.mark.slow),  # Simulation 1
+        pytest.param(10, 30, 0.03, 120, marks=pytest.mark.sets),  # Simulation 2, its smallest and largest noise
+        pytest.param(10, 30, 0.28, 120, marks=pytest.mark.sets),
+        pytest.param(2, 30, 0.14, 200, marks=pytest.mark.slow),  # Simulation 3
+        pytest.param(50, 30, 0.14, 130, marks=pytest.mark.sets),
+        pytest.param(100, 30, 0.14, 130, marks=pytest.mark.sets),
+        pytest.param(10, 20, 0.14, 200, marks=pytest.mark.slow),  # Simulation 4
+        pytest.param(10, 100, 0.14, 60, marks=pytest.mark.sets),
+        pytest.param(10, 200, 0.14, 60, marks=pytest.mark.sets),
     ],
 )
 def test_simulations_of_the_paper(n_im, n_star, sigma, n):
@@ -247,6 +246,7 @@ def test_rules_of_thumb():
         assert (p.s_b, p.s_sigma) == pytest.approx(p.thumb, rel=0.03)
 
 
+@pytest.mark.slow
 def test_the_figures_of_simulation_1():
     """Paper, section 4.1: b = 0.05 px, sigma = 0.16 px; rms over ten fields."""
     b, sigma = np.transpose([(p.b, p.sigma) for p in (predict(n_exposures=10, n_stars=30, sigma=0.14, seed=seed)
@@ -433,6 +433,7 @@ def test_what_was_asked_for_stays_as_it_was():
         settings.degree = 2
 
 
+@pytest.mark.slow
 def test_relative_errors_do_not_depend_on_what_is_known_of_the_common_map():
     """Without a prior the assumed scatter makes the constraints; positions relative to one another do not change."""
     given = {"n_exposures": 11, "n_stars": 80, "sigma": 0.02, "degree": 3, "dithers": 200.0, "seed": 1}
@@ -448,6 +449,7 @@ def test_relative_errors_do_not_depend_on_what_is_known_of_the_common_map():
     assert all_of_it.b_abs > 1.5 * exact.b_abs
 
 
+@pytest.mark.slow
 def test_a_degree_higher_than_that_of_the_widths_of_a_prior():
     prior = Prior(np.zeros((2, 21)), sigma=0.3, static_sigma=0.01)
     table = predict(n_exposures=11, n_stars=80, sigma=0.02, prior=prior).alternatives()
@@ -455,6 +457,7 @@ def test_a_degree_higher_than_that_of_the_widths_of_a_prior():
     assert 4 in table["degree"]
 
 
+@pytest.mark.slow
 def test_alternatives():
     p = predict(n_exposures=8, n_stars=14, sigma=0.02, dynamic=0.4, dithers=40.0)
     table = p.alternatives()

@@ -148,6 +148,7 @@ def test_a_field_that_is_far_smaller_than_the_noise_changes_nothing():
     assert_allclose(turbulent.solution.stars["x_err"], plain.solution.stars["x_err"], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_absolute_errors_grow_with_the_field_and_fall_with_exposures():
     """And what is stated of the scatter of the series beside adds to it."""
     exact = ld.Prior(np.zeros((2, 1)))
@@ -166,6 +167,7 @@ def test_absolute_errors_grow_with_the_field_and_fall_with_exposures():
     assert np.isnan(ld.predict(n_exposures=6, **given, terms=ld.Term.named("pixel_phase", sigma=0.01)).b_abs)
 
 
+@pytest.mark.slow
 def test_it_is_said_and_kept():
     p = ld.predict(n_exposures=8, n_stars=40, sigma=SIGMA, dithers=60.0, n_grid=6,
                    terms=ld.Term.named("turbulence", size=0.1, length=300))  # fmt: skip
@@ -224,6 +226,7 @@ def test_sizes_that_are_none_are_said():
         ld.predict(**GOOD | {"n_stars": 3000}, terms=FIELD)
 
 
+@pytest.mark.slow
 def test_command(capsys):
     asked = ["predict", "--n-exposures", "4", "--n-stars", "30", "--sigma", "0.02", "--degree", "1", "--term"]
     assert main([*asked, "turbulence=0.1:300:1.5:2:30"]) == 0
@@ -263,8 +266,9 @@ def over_stated(prediction, solution):
     return ratios
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("rms", "width"), [(0.1, 50.0), (0.5, 10.0)])
+@pytest.mark.parametrize(
+    ("rms", "width"), [pytest.param(0.1, 50.0, marks=pytest.mark.slow), pytest.param(0.5, 10.0, marks=pytest.mark.sets)]
+)
 def test_turbulence_that_is_forecast_is_what_solve_states(rms, width):
     """Of screens by numpy; and the scatter of stars that took no part is the one forecast."""
     squares = []

@@ -40,7 +40,7 @@ def test_diffraction_pattern_is_that_of_an_annulus(obstruction):
         assert 2 * half / 24 == pytest.approx(1.029, rel=5e-3)
 
 
-@pytest.mark.parametrize("strehl", [0.05, 0.6])
+@pytest.mark.parametrize("strehl", [pytest.param(0.05, marks=pytest.mark.slow), 0.6])
 def test_strehl_ratio_and_halo(strehl):
     """Peak over that without turbulence; what the core does not hold lies in a halo as wide as the seeing."""
     kinds = {"resolution": 10.0, "halo_fwhm": 200.0, "jitter": 1.0, "obstruction": 0.0}
@@ -117,6 +117,7 @@ def test_coma_and_astigmatism_grow_off_axis():
     np.testing.assert_allclose(field, fixed, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_exposures_differ_and_a_seed_repeats_them():
     psf = PupilPSF(strehl=0.14, jitter=1.2, elongation=0.5, coma=0.2)
     drawn = [psf.varied(np.random.default_rng(seed)) for seed in range(15)]
@@ -219,6 +220,7 @@ def test_bound_of_a_gaussian_is_the_textbook_one(sky, read_noise):
     np.testing.assert_allclose(known, bound, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_a_fit_with_the_true_psf_reaches_the_bound():
     """Of 40 stars of all brightnesses; what deviates is 1 to 3 standard deviations of so few."""
     frame = ao_images.frame("symmetric", 0.3, 1, n=40, size=512)
@@ -230,6 +232,7 @@ def test_a_fit_with_the_true_psf_reaches_the_bound():
     assert np.sqrt(np.mean(z**2)) == pytest.approx(1, abs=3 / np.sqrt(2 * 80))
 
 
+@pytest.mark.slow
 def test_nights_take_a_psf_for_all_exposures_or_one_for_each(arrays):
     kinds = {"n_exposures": 2, "size": 128, "n_stars": 4, "dither": 5.0, "noise": False}
     pupil = PupilPSF(strehl=0.3, halo_fwhm=6.0)
@@ -267,6 +270,7 @@ def test_diffraction_is_that_of_maoppy():
     assert image.max() == pytest.approx(theirs.max(), rel=0.01)
 
 
+@pytest.mark.slow
 def test_part_of_the_light_in_the_core_is_that_of_maoppy():
     """A Strehl ratio says the same of the halo as the phase variance that PSFAO19 has for it."""
     model = psfao(4.0, npix=1024)

@@ -68,7 +68,7 @@ EVIDENCE = ld.Prior(np.zeros((2, 1)), sigma="evidence", source="nothing")
         {"static": "fit", "dynamic": 0.0},
         {"loss": "cauchy", "clip": None},
         {"errors": "floor"},
-        {"prior": EVIDENCE},
+        pytest.param({"prior": EVIDENCE}, marks=pytest.mark.slow),
         {"motion": "proper", "epochs": np.linspace(2010, 2016, 8), "words": {"motion": 0.01}},
     ],
     ids=lambda asked: "-".join(asked) or "plain",
@@ -111,6 +111,7 @@ def test_one_after_the_other_and_from_files(tmp_path):
     assert len({mark for each in added for marks in each["exposures"].values() for mark in marks}) == 24
 
 
+@pytest.mark.slow
 def test_options_of_the_base_give_way():
     old, new = parts(simulated().matches.table, ["exp07"])
     found = ld.solve(new, base=ld.solve(old, degree=2, clip=4.0), degree=3)
@@ -225,6 +226,7 @@ def test_refused(tmp_path):
     assert len(ld.solve(new, base=tied, reference=base).names) == 8
 
 
+@pytest.mark.slow
 def test_command(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     table = simulated(dynamic=0.05).matches.table

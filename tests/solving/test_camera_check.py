@@ -45,6 +45,7 @@ def test_what_is_wrong_of_a_camera_is_named_with_its_cure(kind):
     assert check.cure == four_detectors.CURES[kind]
 
 
+@pytest.mark.slow
 def test_what_is_fitted_is_not_asked_about():
     matches = four_detectors.matches("layout", 0)
     assert check_of(matches, layout="fit").state == "pass"
@@ -63,6 +64,7 @@ def test_what_no_dither_tests_is_said_to_be_believed():
     assert check.cure.startswith("dithers larger than the gaps")
 
 
+@pytest.mark.slow
 def test_widths_that_are_stated_are_tested():
     matches = four_detectors.matches(None, 0)
     check = check_of(stated(matches, 1.0, 0))
@@ -120,8 +122,9 @@ def test_departures_of_right_widths_are_those_of_chance():
     assert chi2 / dof == pytest.approx(1, abs=4 * np.sqrt(2 / dof))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(1, 9))
+@pytest.mark.parametrize(
+    "seed", [pytest.param(seed, marks=pytest.mark.slow if seed < 3 else pytest.mark.sets) for seed in range(1, 9)]
+)
 def test_states_hold_for_other_sets(seed):
     assert check_of(four_detectors.matches(None, seed)).state == "pass"
     for kind, cure in four_detectors.CURES.items():

@@ -21,7 +21,7 @@ def span(columns, k):
     return directions[:, :k]
 
 
-@pytest.mark.parametrize(("turn", "unknown"), [(0.0, 4), (0.8, 0)])
+@pytest.mark.parametrize(("turn", "unknown"), [pytest.param(0.0, 4, marks=pytest.mark.slow), (0.8, 0)])
 def test_what_is_unknown(turn, unknown):
     """The null space of the dense matrix: a map of the sky, one of the focal plane, and what `gauge.unknown` lists."""
     field, degree = gsaoi_calibration.night(turn), gsaoi_calibration.DEGREE
@@ -54,6 +54,7 @@ def similarities(sky):
     return np.stack([np.stack(d, axis=1).ravel() for d in ((one, no), (no, one), (x, y), (-y, x))], axis=1)
 
 
+@pytest.mark.slow
 def test_layouts_to_begin_with_do_not_matter():
     """Detectors that lie wrong by pixels, or right: the same stars and detectors."""
     field, found = gsaoi_calibration.night(0.0), []
@@ -67,8 +68,7 @@ def test_layouts_to_begin_with_do_not_matter():
     assert np.sqrt(np.mean((found[0] - found[1]) ** 2)) < 1e-4
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("turn", [0.0, 0.8])
+@pytest.mark.parametrize("turn", [pytest.param(0.0, marks=pytest.mark.sets), pytest.param(0.8, marks=pytest.mark.slow)])
 def test_at_the_bound(turn):
     """Stars, layouts and statics at the bound of the dense matrix, with true errors; 16 draws."""
     found = gsaoi_calibration.calibrate(turn, 16)

@@ -36,7 +36,9 @@ def at(values, covariance, years):
     return values @ step.T, step @ covariance @ step.T
 
 
-@pytest.mark.parametrize(("kind", "epochs"), [("proper", THREE[::2]), ("parallax", FIVE[::2])])
+@pytest.mark.parametrize(
+    ("kind", "epochs"), [pytest.param("proper", THREE[::2], marks=pytest.mark.slow), ("parallax", FIVE[::2])]
+)
 def test_the_dense_oracle_agrees(kind, epochs):
     """Posterior means and covariances, where the catalogue says more of the common maps than anything else."""
     exposures = {"n_exposures": len(epochs), "rotations": np.linspace(0, 40, len(epochs)), "epochs": epochs}
@@ -69,11 +71,11 @@ def test_the_dense_oracle_agrees(kind, epochs):
 @pytest.mark.parametrize(
     ("n", "kind", "sigma", "accuracy"),
     [
-        (6, "proper", None, 0.2),
-        (3, "parallax", None, 0.25),
-        pytest.param(30, "proper", None, 0.1, marks=pytest.mark.slow),
-        pytest.param(30, "proper", 0.3, 0.1, marks=pytest.mark.slow),
-        pytest.param(30, "parallax", None, 0.1, marks=pytest.mark.slow),
+        pytest.param(6, "proper", None, 0.2, marks=pytest.mark.slow),
+        pytest.param(3, "parallax", None, 0.25, marks=pytest.mark.slow),
+        pytest.param(30, "proper", None, 0.1, marks=pytest.mark.sets),
+        pytest.param(30, "proper", 0.3, 0.1, marks=pytest.mark.sets),
+        pytest.param(30, "parallax", None, 0.1, marks=pytest.mark.sets),
     ],
 )
 def test_absolute_errors_are_calibrated(n, kind, sigma, accuracy):
@@ -100,6 +102,7 @@ def test_absolute_errors_are_calibrated(n, kind, sigma, accuracy):
     assert_allclose(ratio, 1, atol=accuracy)
 
 
+@pytest.mark.slow
 def test_stars_of_the_catalogue_have_what_it_knows_of_them():
     """Where the exposures know less the catalogue rules; a star seen once has its motion."""
     sim = field(60, sigma=0.1)
@@ -121,6 +124,7 @@ def test_stars_of_the_catalogue_have_what_it_knows_of_them():
     assert np.median(ratio) == pytest.approx(1, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_tie_settles_where_the_scatter_of_motions_is_known():
     """The map of the positions is not mixed with those that change with time, which the motions of stars then tell."""
     sim = field(60)
@@ -130,6 +134,7 @@ def test_a_tie_settles_where_the_scatter_of_motions_is_known():
     assert "not settled" not in solution.status
 
 
+@pytest.mark.slow
 def test_a_table_of_stars_is_a_prior_of_its_motions():
     """Columns of motions in pixels, with their correlations, serve as those on the sky do."""
     sim = field(60, sky=None)
@@ -147,6 +152,7 @@ def test_a_table_of_stars_is_a_prior_of_its_motions():
         solve(sim.matches, motion="proper", reference=stars)
 
 
+@pytest.mark.slow
 def test_positions_alone_and_parallaxes_alone():
     """What the catalogue does not tell stays as it is: motions without rates, parallaxes without their mean."""
     sim = field(60, FIVE, parallax=0.1)

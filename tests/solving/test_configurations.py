@@ -70,7 +70,9 @@ def test_little_overlap_converges_to_the_minimum(monkeypatch, mosaic, direct):
         assert abs(up - down) / 4 < 1e-3 * np.sqrt(curvature)
 
 
-@pytest.mark.parametrize("degree", range(9))
+@pytest.mark.parametrize(
+    "degree", [*range(5), *(pytest.param(degree, marks=pytest.mark.slow) for degree in range(5, 9))]
+)
 def test_every_degree_reaches_its_bound(degree):
     """Positions at the Cramer-Rao bound, chi2 at its degrees of freedom, for degrees 0 to 8."""
     spread = 0.5 / np.sqrt(1 + np.arange((degree + 1) * (degree + 2) // 2))

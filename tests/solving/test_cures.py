@@ -44,14 +44,15 @@ def assert_cured(kind, seed):
         assert "found here" in after["chi2"].sentence
 
 
-@pytest.mark.parametrize("kind", ["half", "one for all", "degree"])
+@pytest.mark.parametrize("kind", ["half", "one for all", pytest.param("degree", marks=pytest.mark.slow)])
 def test_the_cure_that_is_named_cures(kind):
     assert_cured(kind, 0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", flawed_sets.CURES)
-@pytest.mark.parametrize("seed", range(1, 11))
+@pytest.mark.parametrize(
+    "seed", [pytest.param(seed, marks=pytest.mark.slow if seed < 3 else pytest.mark.sets) for seed in range(1, 11)]
+)
 def test_the_cure_that_is_named_cures_other_sets(kind, seed):
     assert_cured(kind, seed)
 
@@ -67,18 +68,22 @@ def assert_foretold(size, seed):
     return found[2]
 
 
+@pytest.mark.slow
 def test_what_a_degree_leaves_of_turbulence_is_foretold():
     assert assert_foretold(0.8, 206) is None
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [200, 201, 202, 204])
+@pytest.mark.parametrize(
+    "seed",
+    [pytest.param(seed, marks=pytest.mark.slow if seed == 200 else pytest.mark.sets) for seed in (200, 201, 202, 204)],
+)
 @pytest.mark.parametrize("size", [0.8, 3.0])
 def test_what_a_degree_leaves_of_turbulence_is_foretold_in_other_sets(size, seed):
     about = assert_foretold(size, seed)
     assert about or size < 3
 
 
+@pytest.mark.slow
 def test_motions_are_the_cure_of_all_that_they_cause():
     """Places, degrees and errors do not pass either where stars move; fitting their motions brings what is promised."""
     data, rng = dense_model.drawn_set(1)[0], np.random.default_rng(1)
@@ -104,6 +109,7 @@ def test_errors_that_are_wrong_are_not_taken_for_patterns():
     assert {check.cure for check in wrong} == {"--errors floor would bring chi2/dof to 1.00"}
 
 
+@pytest.mark.slow
 def test_turbulence_that_no_degree_ends_is_counted_in_the_errors():
     data = known_displacements.displaced("turbulence", 0, size=5.0, n_stars=70)[0]
     degree = checks_of(solved(data))["degree"]
@@ -141,8 +147,9 @@ def test_of_three_cures_of_a_camera_the_right_one_is_named():
     assert_camera_is_cured("layout", 0, n=5, n_stars=100)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", four_detectors.CURES)
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "seed", [pytest.param(seed, marks=pytest.mark.slow if seed == 1 else pytest.mark.sets) for seed in range(6)]
+)
 def test_of_three_cures_of_a_camera_the_right_one_is_named_in_other_sets(kind, seed):
     assert_camera_is_cured(kind, seed)

@@ -77,6 +77,7 @@ def test_the_choice_is_seeded():
     assert not np.array_equal(first, other)
 
 
+@pytest.mark.slow
 def test_scatter_is_what_the_errors_say():
     """Means over seeds; unequal errors, dithers, and a prior with widths."""
     rng = np.random.default_rng(0)
@@ -255,7 +256,9 @@ def strip(n_exposures, n_seen, share, seed):
 
 
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.LegdistortWarning")
-@pytest.mark.parametrize(("n_exposures", "n_seen", "share"), [(8, 45, 0.4), (10, 45, 0.35)])
+@pytest.mark.parametrize(
+    ("n_exposures", "n_seen", "share"), [(8, 45, 0.4), pytest.param(10, 45, 0.35, marks=pytest.mark.slow)]
+)
 def test_stars_left_out_of_exposures_that_hang_together_weakly(n_exposures, n_seen, share, monkeypatch):
     """Steps along directions that hardly anything determines count, which no few conjugate gradients find."""
     matches = strip(n_exposures, n_seen, share, 1)
@@ -283,6 +286,7 @@ def test_the_registration_of_degree_zero_is_made_without_the_stars_left_out_wher
     assert chosen.scores[0] == pytest.approx(slow[:, 0].sum() / slow[:, 1].sum(), rel=1e-3 if best == 0 else 0.3)
 
 
+@pytest.mark.slow
 def test_of_equal_degrees_the_lowest():
     """With widths that are found, degrees that are not there change nothing."""
     sim = simulate(12, 0.5, 0.5, n_exposures=5)
@@ -299,6 +303,7 @@ def test_widths_allow_more():
     assert chosen.degree >= 2
 
 
+@pytest.mark.slow
 def test_a_mismatched_star_has_no_say():
     sim = simulate(40, 0.5, 0.5, 0.5, n_exposures=6)
     table = sim.matches.table.copy()
@@ -376,6 +381,7 @@ def test_noise_is_no_energy():
     assert max(np.abs(excess)) < degree_choice.ALARM
 
 
+@pytest.mark.slow
 def test_a_convention_is_no_energy():
     """Without a prior all exposures depart alike, by what the convention makes of their common map; degree 3 is all."""
     excess = []
@@ -389,7 +395,7 @@ def test_a_convention_is_no_energy():
     assert max(np.abs(excess)) < 3
 
 
-@pytest.mark.parametrize("quartic", [0.0, 0.03])
+@pytest.mark.parametrize("quartic", [pytest.param(0.0, marks=pytest.mark.slow), 0.03])
 def test_a_common_map_that_nobody_knew_is_no_energy_where_stars_are_many(quartic):
     """It carries the distortion of every exposure to other places by 1.5 px, which makes modes of higher degrees.
 
@@ -405,7 +411,7 @@ def test_a_common_map_that_nobody_knew_is_no_energy_where_stars_are_many(quartic
     assert np.all(np.abs(fifth) < degree_choice.ALARM)
 
 
-@pytest.mark.parametrize("n_exposures", [2, 3])
+@pytest.mark.parametrize("n_exposures", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_energy_beyond_what_an_unknown_map_can_do_is_seen_in_few_exposures(n_exposures):
     """A map that would explain 0.1 px in the end would have to be a hundred pixels large."""
     static, width = np.repeat([1.5, 0], [10, 5]), np.repeat([0.9, 0.1], [10, 5])
@@ -416,7 +422,7 @@ def test_energy_beyond_what_an_unknown_map_can_do_is_seen_in_few_exposures(n_exp
             assert folding(sim, 3, 4, top=n_exposures + 2).excess > 1.8 * degree_choice.ALARM
 
 
-@pytest.mark.parametrize("direct", [True, False])
+@pytest.mark.parametrize("direct", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_energy_of_its_own_is_seen_beside_a_common_map(monkeypatch, direct):
     """Quartic modes of every exposure count, however errors differ, whether the equations are factorised or not."""
     monkeypatch.setattr("legdistort.solving.equations.reduced_system.uses_direct", lambda problem: direct)
@@ -450,6 +456,7 @@ def test_where_similarities_are_in_the_poses_no_energy_is_missed():
     assert max(np.abs(excess)) < degree_choice.ALARM
 
 
+@pytest.mark.slow
 def test_alarm_is_raised():
     """Sixteen stars, precise, with more distortion than they can be fitted with at degree 3."""
     sim = simulate(16, 0.5, 0.5, 0.5, 0.3, 0.3, sigma=0.01, seed=2)
@@ -484,6 +491,7 @@ def test_run_refuses_before_it_reads(tmp_path):
         run(tmp_path / "no.fits", out=tmp_path / "out", solving={"validate": 2})
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_command_line(tmp_path, capsys):
     sim = simulate(30, 0.5, 0.5, n_exposures=5)
@@ -516,26 +524,33 @@ def test_expected_scatter_takes_an_error_for_each_position():
     assert mixed[1] > 1.7 * same[1]
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.AssumptionWarning")  # the alarm is not what is tested
-def test_the_choice_costs_little():
+@pytest.mark.parametrize(
+    "by_degree",
+    [
+        pytest.param((0.5,) * 4, marks=pytest.mark.slow),
+        pytest.param((0.5, 0.3, 0.1, 0.05), marks=pytest.mark.slow),
+        pytest.param((0.5, 0.2), marks=pytest.mark.slow),
+        pytest.param((0.0,), marks=pytest.mark.slow),
+    ],
+)
+def test_the_choice_costs_little(by_degree):
     """Mean error of new positions with the degree chosen, against the best of 0 to 4, which is not known."""
-    for by_degree in ((0.5,) * 4, (0.5, 0.3, 0.1, 0.05), (0.5, 0.2), (0.0,)):
-        for n_stars in (15, 30, 80):
-            rows = []
-            for seed in range(5):
-                sim = simulate(n_stars, *by_degree, seed=seed)
-                grid = sim.truth.grid("exp00", 20)
+    for n_stars in (15, 30, 80):
+        rows = []
+        for seed in range(5):
+            sim = simulate(n_stars, *by_degree, seed=seed)
+            grid = sim.truth.grid("exp00", 20)
 
-                def error(degree, sim=sim, grid=grid):
-                    try:
-                        made = solved(sim, degree=degree)
-                        scatter = accuracy.new_scatter(made, sim.truth.distort, grid, 0.14)
-                    except (FoldError, SolveError):  # no answer for so few stars
-                        return np.inf
-                    return np.sqrt(np.nanmean(scatter**2))
+            def error(degree, sim=sim, grid=grid):
+                try:
+                    made = solved(sim, degree=degree)
+                    scatter = accuracy.new_scatter(made, sim.truth.distort, grid, 0.14)
+                except (FoldError, SolveError):  # no answer for so few stars
+                    return np.inf
+                return np.sqrt(np.nanmean(scatter**2))
 
-                rows.append([error(degree) for degree in ("auto", 0, 1, 2, 3, 4)])
-            chosen, *fixed = np.mean(rows, axis=0)
-            # fifteen stars and ten modes: leaving one star out is leaving much out, and one choice of five weighs much
-            assert chosen < (1.4 if n_stars == 15 else 1.05) * min(fixed), (by_degree, n_stars)
+            rows.append([error(degree) for degree in ("auto", 0, 1, 2, 3, 4)])
+        chosen, *fixed = np.mean(rows, axis=0)
+        # fifteen stars and ten modes: leaving one star out is leaving much out, and one choice of five weighs much
+        assert chosen < (1.4 if n_stars == 15 else 1.05) * min(fixed), n_stars

@@ -48,7 +48,15 @@ def table_of(sim):
     return sim.matches.table.copy()
 
 
-@pytest.mark.parametrize("settings", [{}, {"corr": 0.6}, {"rotations": [0, 90, 180, 270]}, {"flips": [0, 1, 0, 1]}])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        pytest.param({"corr": 0.6}, marks=pytest.mark.slow),
+        pytest.param({"rotations": [0, 90, 180, 270]}, marks=pytest.mark.slow),
+        {"flips": [0, 1, 0, 1]},
+    ],
+)
 def test_joint_is_the_dense_oracle(settings):
     sim = small(**settings)
     solution = solve(sim.matches, degree=2, prior=Prior(sim.truth.static))

@@ -29,6 +29,7 @@ def near():
     return night, legdistort.match(night.table, exposures=night.exposures)
 
 
+@pytest.mark.slow
 def test_a_prior_of_one_detector_of_several_is_refused_with_what_to_do(near):
     _, matches = near
     prior = legdistort.Prior(np.zeros((2, 6)), shape=next(iter(matches.camera.detectors.values())).shape)
@@ -72,6 +73,7 @@ def test_the_check_says_how_far_headers_have_each_detector(far, solution):
     np.testing.assert_allclose([float(each[key]) for key in header_layouts.KEYS], off, atol=1.5)
 
 
+@pytest.mark.slow
 def test_it_does_not_matter_how_wrong_it_was(near, far, solution):
     """The same night by headers that are ten times nearer: the same stars after the map that nothing determines.
 
@@ -103,6 +105,7 @@ def bent():
     return legdistort.match(night.table, exposures=night.exposures)
 
 
+@pytest.mark.slow
 def test_what_nothing_determines_stays_as_headers_have_it(bent):
     """Detectors with distortions of their own are not turned for a map which exposures and detectors exchange."""
     solution = legdistort.solve(bent, degree=2, static="fit")
@@ -115,9 +118,9 @@ def test_what_nothing_determines_stays_as_headers_have_it(bent):
 @pytest.mark.parametrize(
     ("degree", "stated"),
     [
-        (2, {"pose_sigma": {"shift": 3.0, "rotation": 0.003}}),
-        (2, {"pose_sigma": {"shift": 3.0, "rotation": 0.05}}),
-        (3, {"layout_sigma": {"shift": 1.0, "rotation": 0.02}}),
+        pytest.param(2, {"pose_sigma": {"shift": 3.0, "rotation": 0.003}}, marks=pytest.mark.slow),
+        pytest.param(2, {"pose_sigma": {"shift": 3.0, "rotation": 0.05}}, marks=pytest.mark.slow),
+        pytest.param(3, {"layout_sigma": {"shift": 1.0, "rotation": 0.02}}, marks=pytest.mark.slow),
     ],
 )
 def test_what_is_known_little_of_poses_and_layouts_leads_nowhere_astray(bent, degree, stated):
@@ -129,6 +132,7 @@ def test_what_is_known_little_of_poses_and_layouts_leads_nowhere_astray(bent, de
     assert np.abs(solution.camera.headers.shifts).max() < 1.0
 
 
+@pytest.mark.slow
 def test_detectors_together_keep_the_scale_of_headers(bent):
     """However little is stated of them: what all have in common poses take up, and the stars tell nothing of it."""
     solution = legdistort.solve(bent, degree=2, static="fit", layout_sigma={"shift": 20.0, "rotation": 0.5})
@@ -137,7 +141,9 @@ def test_detectors_together_keep_the_scale_of_headers(bent):
     assert solution.chi2 == pytest.approx(solution.dof, rel=0.1)
 
 
-@pytest.mark.parametrize("name", ["pose_sigma", "layout_sigma"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("pose_sigma", marks=pytest.mark.slow), pytest.param("layout_sigma", marks=pytest.mark.slow)]
+)
 def test_the_check_of_absolute_positions_names_what_cures_it(near, name):
     """Where headers may tell what stars do not; and with it the check passes."""
     before, after = (
@@ -192,6 +198,7 @@ def test_what_no_star_ties_is_not_determined(apart, groups):
     assert groups.camera["2"].place.errors == (np.inf,) * 3
 
 
+@pytest.mark.slow
 def test_a_layout_that_hides_the_stars_that_cross_is_named():
     """Farther off than these are looked for: that was blamed on the dithers, which are three times the gaps."""
     night = header_layouts.Night(2, off=2.0, turn=0.05, odd=(70.0, 0.0, 0.0))
@@ -217,6 +224,7 @@ def with_drawn_statics(night, seed, sigma=0.3):
     return in_camera(matches, replace(matches.camera, detectors=detectors))
 
 
+@pytest.mark.slow
 def test_a_layout_beside_statics_with_widths_is_determined():
     """Rounding was taken for a direction that is not: errors were infinite, and a wrong header went into the sky."""
     night = header_layouts.Night(2, off=2.0, turn=0.05, n=7, n_stars=250, odd=(22.0, -24.0, 0.6))
@@ -230,6 +238,7 @@ def test_a_layout_beside_statics_with_widths_is_determined():
     assert "after one affine map of all together" in " ".join(str(solution).split())
 
 
+@pytest.mark.slow
 def test_a_layout_beside_departures_by_evidence_is_determined():
     """Second order was taken for a direction that nothing determines: no star had an absolute error by a catalogue."""
     stars = np.random.default_rng(0).uniform(-400, 2 * (four_detectors.SIZE + four_detectors.GAP) + 340, (160, 2))
@@ -247,11 +256,11 @@ def test_a_layout_beside_departures_by_evidence_is_determined():
 @pytest.mark.slow
 def test_errors_of_a_layout_beside_statics_with_widths_are_right():
     found = []
-    for seed in range(12):
+    for seed in range(6):
         night = header_layouts.Night(seed, off=2.0, turn=0.05, n=7, n_stars=250, odd=(22.0, -24.0, 0.6))
         solution = legdistort.solve(with_drawn_statics(night, seed))
         found.append((night.layout_pull(solution.camera), *night.pulls(solution)))
-    assert np.mean(found, axis=0) == pytest.approx(1, abs=4 * np.sqrt(2 / 24))
+    assert np.mean(found, axis=0) == pytest.approx(1, abs=4 * np.sqrt(2 / 12))
 
 
 def with_false_ties(matches, n):
@@ -264,7 +273,7 @@ def with_false_ties(matches, n):
     return replace(matches, table=table)
 
 
-@pytest.mark.parametrize("n", [1, 2])
+@pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_false_tie_moves_no_detector(apart, n):
     """One or two stars that tie detectors wrongly are left out, and named; the layout stays as headers have it."""
     matches = with_false_ties(legdistort.match(apart.table, exposures=apart.exposures), n)
@@ -306,6 +315,7 @@ def test_ties_are_counted_and_few_are_told(near):
     assert "more stars" in camera.cure
 
 
+@pytest.mark.slow
 def test_stated_widths_determine_it(apart):
     """Shifts known to 2.5 px stand for what no star tells: finite errors, no groups."""
     camera = legdistort.Camera.of_frames(apart.exposures)
@@ -327,7 +337,7 @@ def known_stars(night):
     return legdistort.Matches.from_table(table, camera=legdistort.Camera("four", detectors))
 
 
-@pytest.mark.parametrize("n_sets", [2, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n_sets", [pytest.param(2, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.sets)])
 def test_nothing_stated_of_statics_is_not_none(n_sets):
     """Absolute errors are true where the focal plane has a distortion that nobody stated; dithers and rolls tell it."""
     squares = np.zeros(2)
@@ -341,7 +351,7 @@ def test_nothing_stated_of_statics_is_not_none(n_sets):
     assert squares[0] / squares[1] == pytest.approx(1, abs=0.3 if n_sets > 10 else 0.6)
 
 
-@pytest.mark.parametrize("n_sets", [2, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n_sets", [pytest.param(2, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.sets)])
 def test_a_reference_tells_what_exposures_without_widths_cannot(n_sets):
     """Shear and z^2 of the focal plane, where statics are fitted and exposures have nothing of their own."""
     squares, evidence = np.zeros(2), legdistort.Prior(None, sigma="evidence")
@@ -378,11 +388,12 @@ def pull_across(n_sets, **options):
 WIDTHS = {"shift": 1.0, "rotation": 0.02, "scale": 1e-6}
 
 
-@pytest.mark.parametrize("n_sets", [4, pytest.param(25, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n_sets", [pytest.param(4, marks=pytest.mark.slow), pytest.param(25, marks=pytest.mark.sets)])
 def test_what_the_caller_knows_of_the_layout(n_sets):
     assert pull_across(n_sets, layout_sigma=WIDTHS) == pytest.approx(1, abs=0.5 if n_sets < 10 else 0.2)
 
 
+@pytest.mark.slow
 def test_the_caller_s_widths_are_those_of_a_camera(apart):
     """In pixels of the modes; without an error of the scale that is as large as the rotation's, in radians."""
     matches, turn = known_stars(apart), np.radians(0.02) * header_layouts.SIZE / np.sqrt(3)
@@ -399,9 +410,9 @@ def test_the_caller_s_widths_are_those_of_a_camera(apart):
 @pytest.mark.parametrize(
     ("n_sets", "n_known", "error", "n_wrong"),
     [
-        (4, 80, 0.01, 0),
-        pytest.param(12, 80, 0.05, 0, marks=pytest.mark.slow),
-        pytest.param(12, 40, 0.02, 4, marks=pytest.mark.slow),
+        pytest.param(4, 80, 0.01, 0, marks=pytest.mark.slow),
+        pytest.param(12, 80, 0.05, 0, marks=pytest.mark.sets),
+        pytest.param(12, 40, 0.02, 4, marks=pytest.mark.sets),
     ],
 )
 def test_a_catalogue_joins_detectors(n_sets, n_known, error, n_wrong):
@@ -426,8 +437,9 @@ def test_a_catalogue_joins_detectors(n_sets, n_known, error, n_wrong):
     assert squares[:, 0] / squares[:, 1] == pytest.approx(1, abs=0.25 if n_sets > 10 else 0.4)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("dither", [80.0, 12.0])
+@pytest.mark.parametrize(
+    "dither", [pytest.param(80.0, marks=pytest.mark.slow), pytest.param(12.0, marks=pytest.mark.sets)]
+)
 def test_frames(tmp_path, dither):
     """From images with headers to the stars: across the gaps if dithers are larger, else within detectors."""
     night = header_layouts.Night(13, off=2.5, dither=dither, n=8, n_stars=300)

@@ -113,7 +113,10 @@ class TestPosterior:
             _ = Posterior(data, part, self.SIZES).mean
 
 
-@pytest.mark.parametrize(("seed", "changes"), [(0, {}), (1, {"rolls": 30.0}), (2, {"n": 6, "dynamic": 0.1})])
+@pytest.mark.parametrize(
+    ("seed", "changes"),
+    [pytest.param(0, {}, marks=pytest.mark.slow), (1, {"rolls": 30.0}), (2, {"n": 6, "dynamic": 0.1})],
+)
 def test_sizes_are_those_of_the_dense_model(seed, changes):
     data, _ = dense_model.drawn_set(seed, n_stars=60, **changes)
     dense = dense_model.Model(**data).fit()
@@ -121,6 +124,7 @@ def test_sizes_are_those_of_the_dense_model(seed, changes):
     assert_allclose(found.sizes, dense.sizes[:4], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_dense_model_reaches_the_errors_at_large_departures():
     """Of the twin itself: 10 px a mode, where a convention held while minimising leaves chi2/dof at 80 and more."""
     data, truth = dense_model.drawn_set(0, dynamic=10.0)
@@ -176,6 +180,7 @@ class TestStatic:
         assert right.p > 0.01
         assert off.p < 1e-6
 
+    @pytest.mark.slow
     def test_p_is_evenly_spread_for_right_priors(self):
         sets = (dense_model.drawn_set(seed, n_stars=70) for seed in range(30))
         p = [self.of(data, truth["static"]).p for data, truth in sets]
@@ -260,6 +265,7 @@ class TestCheck:
         assert "believed, not tested" in check.sentence
         assert "dithers" in check.cure
 
+    @pytest.mark.slow
     def test_one_of_two_detectors_is_named(self):
         """Exposures of two detectors of one field, the prior of the second with the wrong sign."""
         data, truth = dense_model.drawn_set(11, rolls=30.0, n=14)
@@ -279,6 +285,7 @@ class TestCheck:
         data, _ = dense_model.drawn_set(12, rolls=30.0)
         assert not [c for c in solved(data, **options).checks if c.name == "prior"]
 
+    @pytest.mark.slow
     def test_many_exposures_are_drawn_from(self):
         data, truth = dense_model.drawn_set(13, rolls=30.0, n=60, n_stars=60)
         assert self.of(data, ld.Prior(truth["static"])).state == "pass"

@@ -48,28 +48,31 @@ def test_an_effect_of_the_size_of_the_errors_is_named(effect):
         assert chi2.cure == next(each.cure for each in EFFECTS if each.name == effect)
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("n_sets", [pytest.param(8, marks=pytest.mark.slow), pytest.param(30, marks=pytest.mark.sets)])
 @each_effect
-def test_effects_are_named_in_nine_of_ten_sets(effect):
-    found = [named(solved(known_displacements.displaced(effect, 100 + seed)[0])) for seed in range(30)]
-    assert sum(effect in names for names in found) >= 27
-    assert sum(bool(names - {effect}) for names in found) <= 3
+def test_effects_are_named_in_nine_of_ten_sets(effect, n_sets):
+    found = [named(solved(known_displacements.displaced(effect, 100 + seed)[0])) for seed in range(n_sets)]
+    few = np.ceil(0.1 * n_sets)
+    assert sum(effect in names for names in found) >= n_sets - few
+    assert sum(bool(names - {effect}) for names in found) <= few
 
 
-@pytest.mark.slow
-def test_nothing_is_named_where_nothing_is():
+@pytest.mark.parametrize(
+    "n_sets", [pytest.param(30, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.sets)]
+)
+def test_nothing_is_named_where_nothing_is(n_sets):
     """Not even where errors are wrong, or exposures noisier than the others."""
     taken = known_displacements.TAKEN, known_displacements.ROLLED, {}, {"dither": 0.5}, {"n": 5}
     found, rng = [], np.random.default_rng(1)
-    for seed in range(100):
+    for seed in range(n_sets):
         data = dense_model.drawn_set(1000 + seed, **taken[seed % 5])[0]
         if seed % 2:
             data["err"] = data["err"] * np.where(data["exposure"] == 3, 0.5, rng.uniform(0.5, 1))[:, None]
         found.append(named(solved(data)))
-    assert sum(map(bool, found)) <= 5
+    assert sum(map(bool, found)) <= 0.05 * n_sets + (1 if n_sets < 100 else 0)  # a standard deviation
 
 
-@pytest.mark.parametrize("kind", ["pixel phase", "step"])
+@pytest.mark.parametrize("kind", [pytest.param("pixel phase", marks=pytest.mark.slow), "step"])
 def test_what_would_be_left_without_an_effect_is_what_is_left_without_it(kind):
     """Chi2 that is promised is that of the same set with the pattern taken off by hand."""
     data, shift = known_displacements.displaced(kind, 3)

@@ -83,11 +83,11 @@ SELF = {"static": "fit", "exposure_degree": 0}
 @pytest.mark.parametrize(
     ("n_sets", "errors", "how"),
     [
-        (40, (0.0, 0.0, 0.0), {"prior": NOTHING}),
-        (40, (0.1, 0.01, 1e-4), {"prior": NOTHING}),
+        pytest.param(40, (0.0, 0.0, 0.0), {"prior": NOTHING}, marks=pytest.mark.slow),
+        pytest.param(40, (0.1, 0.01, 1e-4), {"prior": NOTHING}, marks=pytest.mark.slow),
         pytest.param(60, (0.0, 0.0, 0.0), {"static": 1.0}, marks=pytest.mark.slow),
-        pytest.param(60, (0.1, 0.01, 1e-4), {"static": 1.0}, marks=pytest.mark.slow),
-        pytest.param(60, (0.1, 0.0, 1e-4), {"static": 1.0, "roll": 40.0}, marks=pytest.mark.slow),
+        pytest.param(60, (0.1, 0.01, 1e-4), {"static": 1.0}, marks=pytest.mark.sets),
+        pytest.param(60, (0.1, 0.0, 1e-4), {"static": 1.0, "roll": 40.0}, marks=pytest.mark.sets),
         pytest.param(
             60,
             (0.02, 0.01, 1e-5),
@@ -210,6 +210,7 @@ def test_it_goes_with(options):
     assert all(np.isfinite(each).all() for each in new[1:])
 
 
+@pytest.mark.slow
 def test_it_is_kept(tmp_path):
     """In the matches' file, in the solution and its file, and by the command line."""
     table, poses, _ = exposures(4, n=4, n_stars=60)

@@ -40,9 +40,9 @@ def after_pointing(base, stars, positions, true):
 @pytest.mark.parametrize(
     ("n_sets", "setting", "tolerance"),
     [
-        (6, {}, 0.5),
+        pytest.param(6, {}, 0.5, marks=pytest.mark.slow),
         pytest.param(40, {}, 0.2, marks=pytest.mark.slow),
-        pytest.param(40, {"dynamic": 0.1}, 0.2, marks=pytest.mark.slow),
+        pytest.param(40, {"dynamic": 0.1}, 0.2, marks=pytest.mark.sets),
     ],
 )
 def test_absolute_errors_have_those_of_the_solution(n_sets, setting, tolerance):
@@ -85,7 +85,9 @@ def test_relative_errors_are_those_of_measurement_and_solution():
     assert np.sqrt(np.mean(off[~known] ** 2)) == pytest.approx(0.02, rel=0.4)
 
 
-@pytest.mark.parametrize("with_sky", [False, True])
+@pytest.mark.parametrize(
+    "with_sky", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.slow)]
+)
 def test_files_and_planes_that_are_turned(tmp_path, with_sky):
     """The plane of the solution is the one of its first exposure, that of the other its own: found by the pattern."""
     matches, last, *_ = field(1, rolls=75.0)

@@ -48,8 +48,8 @@ def positions(solution):
 @pytest.mark.parametrize(
     ("words", "prior", "closure"),
     [
-        ({"static": 1.0, "dynamic": 10.0}, True, False),
-        ({"static": 12.0, "dynamic": 3.0, "rolls": 30.0}, False, False),
+        pytest.param({"static": 1.0, "dynamic": 10.0}, True, False, marks=pytest.mark.slow),
+        pytest.param({"static": 12.0, "dynamic": 3.0, "rolls": 30.0}, False, False, marks=pytest.mark.slow),
         ({"static": 1.5, "dynamic": 0.9, "rolls": 30.0, "higher": 0.02}, False, True),
     ],
 )
@@ -77,8 +77,10 @@ ROWS = {
 }
 
 
-@pytest.mark.parametrize("row", ROWS)
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))])
+@pytest.mark.parametrize(
+    "row", [pytest.param(row, marks=[pytest.mark.slow] * (k > 1)) for k, row in enumerate(reversed(ROWS))]
+)
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.sets) for seed in range(2, 8))])
 def test_large_distortions_cost_no_chi2(row, seed):
     """Where a convention holds the plane it is 80 and 270 times its degrees of freedom in the first two rows."""
     words, prior = ROWS[row]
@@ -140,6 +142,7 @@ def test_what_exposures_have_in_common_beyond_the_degree_is_part_of_the_distorti
     assert without.higher_static is None
 
 
+@pytest.mark.slow
 def test_what_is_common_beyond_the_degree_is_a_table(tmp_path):
     """Of every mode, in pixels, with errors; a file has it too."""
     words = ROWS["terms beyond the degree"][0]
@@ -161,7 +164,7 @@ def _without_map(offset, at, data, truth, seen):
     return offset - dense_model.basis(at, 3, 2048)[0] @ np.linalg.lstsq(root * values, root * seen, rcond=None)[0]
 
 
-@pytest.mark.parametrize("sets", [5, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("sets", [pytest.param(5, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.sets)])
 def test_errors_have_those_of_what_is_common_beyond_the_degree(sets):
     """As known they leave a squared pull of 1.55 of stars and of 1.33 of new positions."""
     pulls = {"stars": [], "new": [], "terms": []}
@@ -189,7 +192,7 @@ def test_errors_have_those_of_what_is_common_beyond_the_degree(sets):
         assert true / stated == pytest.approx(1, abs=0.25 if sets > 5 else 0.35), name
 
 
-@pytest.mark.parametrize("seed", [1, 10])
+@pytest.mark.parametrize("seed", [pytest.param(1, marks=pytest.mark.slow), pytest.param(10, marks=pytest.mark.slow)])
 def test_a_misfit_is_enough_to_look_beyond_the_degree(seed):
     """Departures are too small to count in second order; chi2 is 20 times its degrees of freedom without."""
     data, _ = dense_model.drawn_set(seed, **ROWS["terms beyond the degree"][0] | {"higher": 0.05})
@@ -198,6 +201,7 @@ def test_a_misfit_is_enough_to_look_beyond_the_degree(seed):
     assert solution.chi2 / solution.dof == pytest.approx(1, abs=5 * np.sqrt(2 / solution.dof))
 
 
+@pytest.mark.slow
 def test_errors_beyond_the_degree_are_written_and_scale_with_the_others(tmp_path):
     data, _ = dense_model.drawn_set(3, **ROWS["terms beyond the degree"][0])
     solution = solved(data, errors="scale")
@@ -214,6 +218,7 @@ def test_errors_beyond_the_degree_are_written_and_scale_with_the_others(tmp_path
     assert_allclose(*relative)
 
 
+@pytest.mark.slow
 def test_gross_errors_are_found_beside_large_distortions():
     data, truth = dense_model.drawn_set(0, static=1.0, dynamic=10.0)
     rng = np.random.default_rng(0)

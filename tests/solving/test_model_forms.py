@@ -88,6 +88,7 @@ def values(solution, name):
     return np.array([*model(*reference), *reference])
 
 
+@pytest.mark.slow
 def test_a_whole_form_is_the_usual_solution(simulation, plain):
     solution = solve(simulation.matches, model=form())
     assert_allclose(solution.coefficients, plain.coefficients, rtol=0, atol=1e-12)
@@ -107,9 +108,12 @@ def test_a_whole_form_is_the_usual_solution(simulation, plain):
 @pytest.mark.parametrize(
     "domain",
     [
-        {"x_domain": (0, 1000), "y_domain": (-100, 3000)},
-        {"x_domain": (0, 2000), "y_domain": (0, 2000), "x_window": (-1, 0), "y_window": (0, 1)},
-        {},
+        pytest.param({"x_domain": (0, 1000), "y_domain": (-100, 3000)}, marks=pytest.mark.slow),
+        pytest.param(
+            {"x_domain": (0, 2000), "y_domain": (0, 2000), "x_window": (-1, 0), "y_window": (0, 1)},
+            marks=pytest.mark.slow,
+        ),
+        pytest.param({}, marks=pytest.mark.slow),
     ],
 )
 def test_any_domain_is_converted_exactly(simulation, plain, domain):
@@ -179,6 +183,7 @@ def test_fixed_coefficients_keep_their_values(obedient):
     assert np.nanstd(solution.residuals["dx"].value) == pytest.approx(SIGMA, rel=0.25)
 
 
+@pytest.mark.slow
 def test_fixed_coefficients_against_a_dense_solution(obedient):
     """All unknowns in one vector, without what is fixed; the gauge held for maps that all exposures take back."""
     matches, _ = obedient

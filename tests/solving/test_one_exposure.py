@@ -115,6 +115,7 @@ def test_the_stars_are_found_by_position_and_the_file_is_read_again(tmp_path):
     assert np.sqrt(np.mean((np.column_stack([x, y]) - true) ** 2)) < 0.03
 
 
+@pytest.mark.slow
 def test_one_frame_runs_with_a_catalogue(tmp_path, capsys):
     sim = ld.simulate_exposures(small=True, seed=3, n_exposures=2)
     (frame, _), sky = sim.write(tmp_path / "frames"), sim.truth.sky
@@ -197,6 +198,7 @@ def test_options_that_compare_exposures_are_refused(options, words):
         ld.solve(matches)
 
 
+@pytest.mark.slow
 def test_the_report_has_no_empty_pictures():
     """Expected residuals count what the catalogue knows of its stars, as those that are there do."""
     table, catalogue, _ = one_exposure(2)

@@ -214,6 +214,7 @@ def test_order_of_exposures_does_not_matter():
     assert_allclose(solve(turned, prior=prior).diagnostics.widths, found(sim).diagnostics.widths, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_errors_known_up_to_a_factor():
     """Errors stated twice too small: with errors="scale" the widths are what they were."""
     sim = simulate(15)
@@ -231,6 +232,7 @@ def test_errors_known_up_to_a_factor():
     assert wrong.diagnostics.error_scale == pytest.approx(2 * again.diagnostics.error_scale, rel=0.01)
 
 
+@pytest.mark.slow
 def test_mismatches_do_not_widen_them():
     sim = simulate(8, "flat", seed=3)
     bad = np.random.default_rng(0).choice(len(sim.matches.table), 3, replace=False)
@@ -247,6 +249,7 @@ def test_mismatches_do_not_widen_them():
     )
 
 
+@pytest.mark.slow
 def test_one_prior_one_set_of_widths():
     """A Prior shared by detectors pools them; one each keeps them apart; numbers stay what they are."""
     sim = simulate(14)
@@ -265,6 +268,7 @@ def test_one_prior_one_set_of_widths():
     assert len(mixed["even"]) == 3
 
 
+@pytest.mark.slow
 def test_some_of_many_exposures_are_enough(monkeypatch):
     sim = simulate(12, n_exposures=30)
     whole = found(sim).diagnostics.widths
@@ -415,7 +419,13 @@ def test_a_plan_needs_numbers():
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("arguments", [["--prior-sigma", "evidence"], ["--prior-sigma", "0.9"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        pytest.param(["--prior-sigma", "evidence"], marks=pytest.mark.slow),
+        pytest.param(["--prior-sigma", "0.9"], marks=pytest.mark.slow),
+    ],
+)
 def test_command_line(arguments, tmp_path, capsys):
     sim = simulate(7)
     table = sim.matches.table.copy()
@@ -444,9 +454,14 @@ def errors(solution, truth, places):
     return [accuracy.bias(solution.estimate.positions, truth.positions, removed="similarity"), *scatter]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("n_stars", [6, 10, 15, 30, 80])
-@pytest.mark.parametrize("spectrum", SPECTRA)
+@pytest.mark.parametrize(
+    ("spectrum", "n_stars"),
+    [
+        pytest.param(name, n, marks=pytest.mark.slow if (name, n) == ("falling", 10) else pytest.mark.sets)
+        for name in SPECTRA
+        for n in (6, 10, 15, 30, 80)
+    ],
+)
 def test_never_much_worse_than_the_best_fixed_degree(spectrum, n_stars):
     """Mean errors over seeds; of new positions the errors of the correction alone, which is the hardest test."""
     rows = []
@@ -526,7 +541,7 @@ def _drawn_to_what_they_show(seed, **words):
     return np.sum(np.abs(offset) ** 2), np.sum(variance), solution
 
 
-@pytest.mark.parametrize(("words", "limit"), [({}, 0.06), ({"n_stars": 16}, 0.12)])
+@pytest.mark.parametrize(("words", "limit"), [({}, 0.06), pytest.param({"n_stars": 16}, 0.12, marks=pytest.mark.slow)])
 def test_without_a_mean_exposures_are_drawn_to_the_static_distortion_that_they_show(words, limit):
     """A static distortion of 1 px a mode, departures of 0.05: about nothing, widths would be of a pixel."""
     square, variance, solution = _drawn_to_what_they_show(1, dynamic=0.05, **words)
@@ -537,8 +552,9 @@ def test_without_a_mean_exposures_are_drawn_to_the_static_distortion_that_they_s
     assert "scatter of a coefficient, found from the exposures" in str(solution)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("dynamic", [0.05, 0.4])
+@pytest.mark.parametrize(
+    "dynamic", [pytest.param(0.05, marks=pytest.mark.slow), pytest.param(0.4, marks=pytest.mark.sets)]
+)
 def test_errors_without_a_mean_are_calibrated(dynamic):
     square, variance = np.sum([_drawn_to_what_they_show(seed, dynamic=dynamic)[:2] for seed in range(20)], axis=0)
     assert square / variance == pytest.approx(1, abs=0.25)

@@ -56,6 +56,7 @@ def names(solution):
     return np.array([max(set(found[star]), key=found[star].count) for star in solution.estimate.star_names])
 
 
+@pytest.mark.slow
 def test_motions_explain_what_positions_do_not(epochs, moving):
     still = solve(epochs, degree=2)
     assert moving.settings.motion == "proper"
@@ -110,6 +111,7 @@ def test_an_epoch_kept_out_is_predicted(epochs):
     assert offsets["still"] > 3 * offsets["moved"]
 
 
+@pytest.mark.slow
 def test_positions_beyond_the_shape_are_left_out_by_name(shared_data):
     """Three of all stars lie outside 1024 pixels and their margin, all in the last list, which is used for all that."""
     with pytest.warns(AssumptionWarning, match="3 positions lie outside their detector and are left out: star") as told:

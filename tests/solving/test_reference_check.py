@@ -62,7 +62,7 @@ def test_a_right_reference_passes_where_exposures_are_as_good():
         ),
         ("five years off", "fail", "they agree with epochs that are 5 years later"),
         ("errors x 1000", "warn", "its errors are smaller than it states"),
-        ("errors / 1000", "warn", "its errors were taken 9.4e+02 times as large"),
+        pytest.param("errors / 1000", "warn", "its errors were taken 9.4e+02 times as large", marks=pytest.mark.slow),
         ("20 % blunders", "unknown", "agree with the exposures"),
     ],
 )
@@ -79,6 +79,7 @@ def test_epochs_that_are_right_are_not_named():
     assert "years" not in check.sentence
 
 
+@pytest.mark.slow
 def test_errors_that_are_found_are_not_blamed():
     for fault in ("errors x 1000", "errors / 1000"):
         assert check_of(solved(0, fault, reference_error="found")).state == "unknown"
@@ -90,12 +91,14 @@ def test_few_stars_tell_nothing_of_errors():
     assert "its errors (of 4 stars) are believed" in check.sentence
 
 
+@pytest.mark.slow
 def test_many_mismatches_are_named():
     check = check_of(solved(1, "20 % blunders"))
     assert check.state == "warn"
     assert "of 40 stars of the reference lie elsewhere in it" in check.sentence
 
 
+@pytest.mark.slow
 def test_factors_have_what_was_known_beforehand():
     factors = solved(0, "five years off").factors
     assert list(factors["name"]) == ["static distortion", "reference: positions", "reference: map"]
@@ -121,8 +124,14 @@ def test_what_is_said_to_show_shows(nu):
     assert addition_that_shows(0) == np.inf
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("prior", "rolls"), [(True, 0.0), (True, 30.0), (False, 30.0)])
+@pytest.mark.parametrize(
+    ("prior", "rolls"),
+    [
+        pytest.param(True, 0.0, marks=pytest.mark.sets),
+        pytest.param(True, 30.0, marks=pytest.mark.slow),
+        pytest.param(False, 30.0, marks=pytest.mark.sets),
+    ],
+)
 def test_statistics_of_right_references_are_those_of_chance(prior, rolls):
     made = [solved(seed, prior=prior, taken={"rolls": rolls}).gauge.tie.agreement for seed in range(40)]
     for chi2, dof in ((sum(m.chi2 for m in made), sum(m.dof for m in made)),
@@ -132,8 +141,14 @@ def test_statistics_of_right_references_are_those_of_chance(prior, rolls):
     assert stats.kstest(p, "uniform").pvalue > 1e-3
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("prior", "rolls"), [(True, 0.0), (True, 30.0), (False, 30.0)])
+@pytest.mark.parametrize(
+    ("prior", "rolls"),
+    [
+        pytest.param(True, 0.0, marks=pytest.mark.sets),
+        pytest.param(True, 30.0, marks=pytest.mark.slow),
+        pytest.param(False, 30.0, marks=pytest.mark.sets),
+    ],
+)
 def test_wrong_references_are_found(prior, rolls):
     for fault in ("bent by 1 px", "five years off", "errors x 1000"):
         states = [check_of(solved(seed, fault, prior=prior, taken={"rolls": rolls})).state for seed in range(10)]
@@ -191,8 +206,14 @@ def test_what_bends_a_reference_alone_bends_nothing_else(degree, options):
     assert f"a map of degree {degree} that is its own" in second.gauge.tie.statement
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("degree", "error", "prior"), [(2, 0.001, True), (3, 0.01, True), (3, 0.001, False)])
+@pytest.mark.parametrize(
+    ("degree", "error", "prior"),
+    [
+        pytest.param(2, 0.001, True, marks=pytest.mark.sets),
+        pytest.param(3, 0.01, True, marks=pytest.mark.slow),
+        pytest.param(3, 0.001, False, marks=pytest.mark.slow),
+    ],
+)
 def test_errors_beside_a_map_of_the_reference_alone_are_calibrated(degree, error, prior, monkeypatch):
     """20 sets each: absolute errors, and those of the catalogue's stars relative to the others."""
     monkeypatch.setattr(made_catalogues, "ERROR", error)
@@ -207,7 +228,7 @@ def test_errors_beside_a_map_of_the_reference_alone_are_calibrated(degree, error
     assert squares[:, 0].sum() / squares[:, 1].sum() == pytest.approx(1, abs=0.2)
 
 
-@pytest.mark.parametrize("degree", [2, 3])
+@pytest.mark.parametrize("degree", [pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
 def test_the_degree_that_is_named_cures(degree):
     data, truth = dense_model.drawn_set(2, rolls=30.0, dynamic=0.05)
     table = bent(made_catalogues.catalogue(truth["stars"], 2), truth["stars"], degree, 1.0)
@@ -222,7 +243,9 @@ def test_the_degree_that_is_named_cures(degree):
     assert "agree with the exposures" in cured.sentence
 
 
-@pytest.mark.parametrize("options", [{"static": "hold"}, {"static": "hold", "layout": "fit"}])
+@pytest.mark.parametrize(
+    "options", [{"static": "hold"}, pytest.param({"static": "hold", "layout": "fit"}, marks=pytest.mark.slow)]
+)
 def test_detectors_that_are_distorted_are_to_be_fitted(options):
     """Nothing was given of their distortions that could be left out; with these fitted the reference agrees."""
     matches, rng = four_detectors.matches("static", 2, n=6, n_stars=160), np.random.default_rng(2)

@@ -113,16 +113,15 @@ def test_absolute_positions_become_as_good_as_relative_ones(sim):
     assert after.chi2 / after.dof == pytest.approx(before.chi2 / before.dof, abs=0.05)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "error", "settings"),
     [
-        (60, 0.02, {}),
-        (30, 0.001, {}),
-        (15, 0.05, {}),
-        (4, 0.05, {}),
-        (40, 0.02, {"degree": 1}),
-        (40, 0.02, {"degree": 0, "dynamic": 0.0, "static": 0.0}),
+        pytest.param(60, 0.02, {}, marks=pytest.mark.slow),
+        pytest.param(30, 0.001, {}, marks=pytest.mark.sets),
+        pytest.param(15, 0.05, {}, marks=pytest.mark.sets),
+        pytest.param(4, 0.05, {}, marks=pytest.mark.slow),
+        pytest.param(40, 0.02, {"degree": 1}, marks=pytest.mark.sets),
+        pytest.param(40, 0.02, {"degree": 0, "dynamic": 0.0, "static": 0.0}, marks=pytest.mark.slow),
     ],
 )
 def test_absolute_errors_are_calibrated(n, error, settings):
@@ -138,8 +137,9 @@ def test_absolute_errors_are_calibrated(n, error, settings):
     assert np.mean(squares) == pytest.approx(1, abs=0.15)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("static", [0.5, 1.5])
+@pytest.mark.parametrize(
+    "static", [pytest.param(0.5, marks=pytest.mark.slow), pytest.param(1.5, marks=pytest.mark.sets)]
+)
 def test_errors_are_calibrated_under_a_static_distortion_that_nobody_told(static):
     squares = []
     for seed in range(40):
@@ -182,9 +182,14 @@ def test_stars_are_as_good_as_a_good_catalogue():
     assert np.mean(pulls_of[False]) == pytest.approx(1, abs=0.4)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("n", "error", "blunders"), [(30, 0.001, 0.0), (60, 1.0, 0.0), (60, 0.05, 0.2), (30, 0.01, 0.2)]
+    ("n", "error", "blunders"),
+    [
+        pytest.param(30, 0.001, 0.0, marks=pytest.mark.slow),
+        pytest.param(60, 1.0, 0.0, marks=pytest.mark.sets),
+        pytest.param(60, 0.05, 0.2, marks=pytest.mark.sets),
+        pytest.param(30, 0.01, 0.2, marks=pytest.mark.slow),
+    ],
 )
 def test_stars_of_a_catalogue_are_calibrated(n, error, blunders):
     """20 sets each; blunders of 1 px are left out, and a poor catalogue makes no relative error larger."""
@@ -288,7 +293,14 @@ def test_mismatched_stars_are_rejected_by_name(sim):
     assert np.mean(pulls(sim, solution) ** 2) == pytest.approx(1, abs=0.4)
 
 
-@pytest.mark.parametrize(("rounds", "words"), [(3, "may be off by as much"), (4, "too little to matter"), (10, None)])
+@pytest.mark.parametrize(
+    ("rounds", "words"),
+    [
+        pytest.param(3, "may be off by as much", marks=pytest.mark.slow),
+        (4, "too little to matter"),
+        pytest.param(10, None, marks=pytest.mark.slow),
+    ],
+)
 def test_a_tie_that_does_not_settle_says_how_far_it_is(monkeypatch, caplog, rounds, words):
     """A static distortion of 12 px, unknown: the plane moves by 9, 0.8, 0.08 and 0.004 px; its error is 0.03 px."""
     sim = simulate(static=12.0)
@@ -507,6 +519,7 @@ def test_without_headers_the_reference_gives_the_sky(night, tied, how):
     assert "arcsec/px, from the reference" in in_tables.sky_sentence(solution)
 
 
+@pytest.mark.slow
 def test_proper_motions_matter(night, tied):
     reference = gaia(night, motion=20.0)
     moved = solve(

@@ -92,6 +92,7 @@ def test_poses_are_those_of_the_exposures_that_agree(n_junk):
     assert list(solution.left_out) == junk
 
 
+@pytest.mark.slow
 def test_a_few_pixels_are_found_by_the_fit():
     """Errors far below those that pairs show, far above those stated."""
     sim = precise(5)
@@ -197,6 +198,7 @@ def test_many_mismatches_cost_little_and_no_exposure(share):
     assert error(solution, sim) < 1.1 * error(clean, sim)
 
 
+@pytest.mark.slow
 def test_the_choice_of_the_degree_decides_mismatches_once_a_degree(monkeypatch):
     """Not anew in each of the fits that leave some stars out; and they do not sway it."""
     sim = precise(4, n_stars=34, degree=1)
@@ -217,7 +219,9 @@ def test_the_choice_of_the_degree_decides_mismatches_once_a_degree(monkeypatch):
 
 
 @pytest.mark.parametrize("noise", [1.0, 1.5])
-@pytest.mark.parametrize("n_exposures", [2, 3, 4, 11])
+@pytest.mark.parametrize(
+    "n_exposures", [2, pytest.param(3, marks=pytest.mark.slow), 4, pytest.param(11, marks=pytest.mark.slow)]
+)
 def test_clean_data_are_solved_as_without_clipping(n_exposures, noise):
     sim = precise(n_exposures, noise=noise, seed=1)
     solution, plain = solve(sim.matches), solve(sim.matches, clip=None)
@@ -239,11 +243,13 @@ def test_no_more_is_left_out_than_leaves_something_to_judge_by():
     assert {check.name: check.state for check in solution.checks}["chi2"] == "fail"
 
 
-@pytest.mark.slow
-def test_clean_sets_lose_nothing():
-    """200 sets, half of them of three exposures; and errors stated 1.5 times too small."""
+@pytest.mark.parametrize(
+    "n_sets", [pytest.param(60, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.sets)]
+)
+def test_clean_sets_lose_nothing(n_sets):
+    """Half of them of three exposures; and errors stated 1.5 times too small."""
     n_rejected = 0
-    for seed in range(200):
+    for seed in range(n_sets):
         sim = precise(3 if seed % 2 else 6, n_stars=25, seed=seed, noise=1.5 if seed % 4 > 1 else 1.0)
         solution = solve(sim.matches, prior=Prior(sim.truth.static) if seed % 3 else None)
         assert not solution.left_out
@@ -348,6 +354,7 @@ def test_a_file_given_twice_is_one_exposure(frames, tmp_path):
     assert left_out == {"renamed": "its pixels are those of exp00"}
 
 
+@pytest.mark.slow
 def test_the_command_measures_it_once(frames, tmp_path, capsys):
     shutil.copy(frames[0], tmp_path / "renamed.fits")
     out = str(tmp_path / "stars.ecsv")
@@ -528,7 +535,13 @@ def test_an_exposure_that_bends_more_than_others_does_not_contradict_them():
 
 @no_position
 @pytest.mark.parametrize(
-    ("share", "size", "serves"), [(0.01, 0.3, True), (0.02, 0.3, True), (0.04, 0.2, True), (0.3, 20.0, False)]
+    ("share", "size", "serves"),
+    [
+        (0.01, 0.3, True),
+        pytest.param(0.02, 0.3, True, marks=pytest.mark.slow),
+        pytest.param(0.04, 0.2, True, marks=pytest.mark.slow),
+        pytest.param(0.3, 20.0, False, marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.parametrize("compiled_from", [0, 20_000])
 def test_a_plain_fit_leads_to_the_same_observations_as_robust_start_values(

@@ -38,6 +38,7 @@ def off(mask, solution, q, degree=2):
     return np.std(beyond(found - mask.map(q), q, mask.size, degree))
 
 
+@pytest.mark.slow
 def test_the_map_is_as_good_as_it_can_be(mask, solution):
     q = mask.at()
     optimum, chi2 = mask.optimum(q)
@@ -62,6 +63,7 @@ def test_a_static_distortion_that_is_told_badly_is_found():
         assert [each.name for each in found.gauge.unknown] == 2 * ["static"]  # shears: nothing tells of these
 
 
+@pytest.mark.slow
 def test_numbers_are_found_where_poses_are_hardly_known(mask, solution):
     """What follows the numbers may be known to a few digits; the normal equations of these are positive still."""
     with pytest.warns(AssumptionWarning, match="2 of 38 unknowns of the shared distortion are not"):
@@ -86,6 +88,7 @@ def test_errors_of_new_positions_hold_it(mask, solution):
     assert 0.5 < np.median(sigma) / stated < 1.5
 
 
+@pytest.mark.slow
 def test_it_is_a_part_of_the_distortion(mask, solution, tmp_path):
     """Not of what terms displace positions by; in WCS, files and their views, of all exposures alike."""
     assert_allclose(solution.residuals["x_terms"].value, 0, atol=1e-12)
@@ -133,6 +136,7 @@ def test_functions_are_independent_of_the_series_and_of_unit_size():
     assert_allclose(functions.fields(q, numbers.T), values @ numbers.T, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_several_detectors_have_names(mask):
     table = mask.matches.table.copy()
     second = np.isin(table["exposure"], ["m1", "m3", "m5"])
@@ -156,6 +160,7 @@ def test_where_it_cannot_be(mask):
             ld.solve(matches, degree=2, terms="rough_static")
 
 
+@pytest.mark.slow
 def test_poses_follow_the_errors_of_the_term(mask, monkeypatch):
     """Poses depart from given ones by the errors of the splines, which is no contradiction."""
     calls, asked = [], known_poses.contradiction

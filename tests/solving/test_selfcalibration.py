@@ -143,8 +143,7 @@ def test_recovers_a_static_distortion():
     assert map_error(solution, sim.truth.static) == pytest.approx(expected_map_error(solution), rel=0.5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("own", [0, 1])
+@pytest.mark.parametrize("own", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.sets)])
 def test_a_gsaoi_map_is_recovered_at_the_bound(own):
     """The real map of degree 5, HST-like rolls: rms error up to an affine map, against the reported one, 40 seeds."""
     static = Prior.from_model(gsaoi_static(2), shape=SHAPE, direction="detector_to_reference", degree=5).mean

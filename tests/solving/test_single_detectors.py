@@ -51,9 +51,9 @@ def drawn(gsaoi):
 
 @pytest.mark.slow
 def test_errors(gsaoi):
-    """Relative ones, projected as the positions are, and absolute ones: six draws of some fifty modes."""
+    """Relative ones, projected as the positions are, and absolute ones: three draws of some fifty modes."""
     ratios, absolute = [], []
-    for seed in range(6):
+    for seed in range(3):
         night, _, solution = draw(gsaoi, seed)
         true, n = night.sky[solution.estimate.star_names], len(solution.estimate.star_names)
         left = gsaoi_images.without_common_map(solution.estimate.positions, true, 3)
@@ -65,10 +65,11 @@ def test_errors(gsaoi):
         reported = np.stack([solution.stars[name].value for name in ("x_err_abs", "y_err_abs")], axis=1)
         absolute.append(np.mean(without_similarity(solution.estimate.positions, true) ** 2) / np.mean(reported**2))
     print(ratios, absolute)
-    assert np.mean(ratios) == pytest.approx(1, abs=0.35)
+    assert np.mean(ratios) == pytest.approx(1, abs=0.5)
     assert 0.35 < np.mean(absolute) < 1.5
 
 
+@pytest.mark.slow
 def test_it_is_what_it_says(drawn, gsaoi, tmp_path):
     """A solution of single detectors, of which WCSs, residuals and files are as of any other."""
     _, table, solution = drawn
@@ -85,6 +86,7 @@ def test_it_is_what_it_says(drawn, gsaoi, tmp_path):
     assert np.array_equal(again["frame03-2"].correct(xy), solution["frame03-2"].correct(xy))
 
 
+@pytest.mark.slow
 def test_one_detector_is_as_without_camera(gsaoi):
     """The layout of a single detector is in the poses: the positions are those of the same prior without a camera."""
     table = gsaoi_images.Night(n_exposures=5, n_stars=250).table(sigma=SIGMA)
@@ -101,6 +103,7 @@ def test_one_detector_is_as_without_camera(gsaoi):
     assert np.sqrt(np.mean((both[0] - both[1]) ** 2)) < 0.1 * np.nanmedian(usual.stars["x_err"].value)
 
 
+@pytest.mark.slow
 def test_other_corrections_are_of_single_detectors_too(drawn, gsaoi):
     _, table, solution = drawn
     compared = baselines.compare(legdistort.Matches.from_table(table, camera=gsaoi), solution)

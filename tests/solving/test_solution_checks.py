@@ -130,7 +130,12 @@ def test_score_of_cells_is_the_chi2_that_a_dense_fit_gains():
 
 
 @pytest.mark.parametrize(
-    ("taken", "state"), [({"dither": 0.5}, "unknown"), ({}, "pass"), ({"rolls": 30.0, "dither": 0.0}, "pass")]
+    ("taken", "state"),
+    [
+        ({"dither": 0.5}, "unknown"),
+        pytest.param({}, "pass", marks=pytest.mark.slow),
+        pytest.param({"rolls": 30.0, "dither": 0.0}, "pass", marks=pytest.mark.slow),
+    ],
 )
 def test_what_stars_would_hide_is_not_said_to_be_absent(taken, state):
     """A pattern of the detector of 0.1 px goes into the stars where nothing moves them over it; numpy alone."""
@@ -150,6 +155,7 @@ def test_what_stars_would_hide_is_not_said_to_be_absent(taken, state):
         assert "turned camera" in found["place"].cure
 
 
+@pytest.mark.slow
 def test_statistics_have_the_mean_they_state():
     found = [residuals(solved(simulated(seed, n_exposures=4, n_stars=30).matches)) for seed in range(25)]
     for get in (
@@ -170,6 +176,7 @@ def test_freedom_of_observations_sums_to_that_of_chi2():
     assert found.freedom.sum() == pytest.approx(solution.dof - found.released.shape[2])
 
 
+@pytest.mark.slow
 def test_chi2_of_few_observations_is_about_one_where_the_gauge_has_a_second_order():
     found, values = [], []
     for seed in range(20):
@@ -196,6 +203,7 @@ def test_the_last_system_of_the_minimisation_serves_checks_and_errors(clip):
     assert made.information == pytest.approx(again.information, rel=1e-6, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_second_order_of_the_gauge_costs_no_chi2_and_is_no_fault_of_the_degree():
     """Many precise positions show where a common map is held at a value that is not the true one: it is not held."""
     matches = ld.simulate_matches(n_exposures=20, n_stars=400, sigma=0.02, degree=3, static=1.5, seed=5).matches
@@ -320,6 +328,7 @@ def test_a_pattern_on_the_detector_is_seen_where_exposures_are_dithered():
     assert states(solved(matches))["place"] == "pass"
 
 
+@pytest.mark.slow
 def test_a_pattern_too_small_to_matter_passes_and_is_said():
     matches = simulated(2, n_exposures=12, n_stars=500, dither=300.0).matches
     table = matches.table.copy()
@@ -556,6 +565,7 @@ class TestDuplicates:
         assert abs(np.mean(others[others < 0.5])) < 0.02
         assert np.abs(others[others < 0.5]).max() < 0.3
 
+    @pytest.mark.slow
     def test_what_exposures_share_beside_their_noise_makes_no_copies_of_them(self):
         check = self.of(self.refracted(6))
         assert check.state == "warn"
@@ -563,6 +573,7 @@ class TestDuplicates:
         assert "leave one of them out" not in check.cure
         assert check.cure.startswith("see ")
 
+    @pytest.mark.slow
     def test_a_copy_is_found_among_exposures_that_share_a_pattern(self):
         check = self.of(self.again(self.refracted(6)))
         assert check.state == "fail"
@@ -605,6 +616,7 @@ def test_an_exposure_that_departs_more_than_the_others_is_named(prior):
     assert re.search(r"e10 2\d times as far as the others", sentence)
 
 
+@pytest.mark.slow
 def test_exposures_that_depart_alike_or_are_poor_are_not_named():
     for seed in range(6):
         assert departures(seed)[0] == []

@@ -38,7 +38,14 @@ def with_odd_stars(kind, seed):
     return data, ld.Prior(truth["static"])
 
 
-@pytest.mark.parametrize("kind", ["two places", "on a curve", "with its flux"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param("two places", marks=pytest.mark.slow),
+        pytest.param("on a curve", marks=pytest.mark.slow),
+        "with its flux",
+    ],
+)
 def test_stars_that_contradict_themselves_are_named_by_what_they_look_like(kind):
     data, prior = with_odd_stars(kind, 1)
     check = checks_of(data, prior=prior)["stars"]

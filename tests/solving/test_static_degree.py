@@ -79,18 +79,20 @@ def test_the_degree_that_is_missing_is_named_and_what_it_reaches():
     assert_named(static_set(3, 1), 3, 5)
 
 
+@pytest.mark.slow
 def test_the_same_of_a_camera():
     assert_named(static_set(4, 2, degree=3, n=5, n_stars=120), 2, 3)
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 @pytest.mark.parametrize("seed", [3, 4, 5])
 def test_the_same_of_a_camera_of_degree_5(seed):
     assert_named(static_set(seed, 2), 3, 5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(5, 12))
+@pytest.mark.parametrize(
+    "seed", [pytest.param(seed, marks=pytest.mark.slow if seed == 5 else pytest.mark.sets) for seed in range(5, 12)]
+)
 def test_the_same_of_other_sets(seed):
     assert_named(static_set(seed, 1), 3, 5)
 

@@ -18,6 +18,7 @@ def told(solution, tmp_path):
     return found
 
 
+@pytest.mark.slow
 def test_of_a_camera_by_detector_with_the_error(tmp_path):
     """A camera file is right but for 0.4 px of x y on detector 1: of four, a map of all together takes some of it."""
     matches = four_detectors.matches("static", 1, n=6, n_stars=120)

@@ -103,6 +103,12 @@ SETTINGS = {
 }
 
 
+#: One of each kind of estimation.
+QUICK = {"plain", "exact prior", "cauchy", "clipped", "motions", "reference", "static fitted", "scale"}
+#: What a solution takes ten seconds with: its order is looked at.
+LONG = {"degree chosen"}
+
+
 def found(solution, names=None):
     """Positions, errors (n, 2) and the others (n, k) of the stars in the order of their numbers, and the solution."""
     stars = solution.stars
@@ -159,13 +165,18 @@ def solved():
 
 
 def cases(*without):
-    """Settings and seeds, of which those beyond the first are slow, and a degree that is chosen."""
+    """Settings and seeds; those beyond the first are sets, and slow is what is much like another."""
     made = [(setting, seed) for setting in SETTINGS if setting not in without for seed in range(2)]
-    slow = [seed > 0 or setting == "degree chosen" for setting, seed in made]
-    return [pytest.param(*each, marks=[pytest.mark.slow] * s) for each, s in zip(made, slow, strict=True)]
+    others = [setting in LONG or seed > 0 for setting, seed in made]
+    return [
+        pytest.param(*each, marks=pytest.mark.sets if other else [pytest.mark.slow] * (each[0] not in QUICK))
+        for each, other in zip(made, others, strict=True)
+    ]
 
 
-@pytest.mark.parametrize(("setting", "seed"), cases())
+@pytest.mark.parametrize(
+    ("setting", "seed"), [*cases(*LONG), *(pytest.param(each, 0, marks=pytest.mark.slow) for each in LONG)]
+)
 def test_order_and_names(setting, seed, solved):
     one, first = solved(setting, seed)
     order = np.random.default_rng(0).permutation(len(one.columns["x"]))
@@ -193,7 +204,7 @@ def turned(one, linear, shift):
     return replace(one, poses=poses, reference=known)
 
 
-PLANES = {
+PLANES = {  # reflections alone by default
     "shifted": (np.eye(2), np.array([1234.5, -777.7])),
     "turned": (np.array([[0.0, -1.0], [1.0, 0.0]]), np.zeros(2)),
     "scaled": (1.02 * np.eye(2), np.zeros(2)),
@@ -201,7 +212,9 @@ PLANES = {
 }
 
 
-@pytest.mark.parametrize("plane", PLANES)
+@pytest.mark.parametrize(
+    "plane", [pytest.param(name, marks=[pytest.mark.slow] * (name != "mirrored")) for name in PLANES]
+)
 @pytest.mark.parametrize(("setting", "seed"), cases())
 def test_the_plane(setting, seed, plane, solved):
     """What counts as unknown has an error beyond a pixel of the plane, which is another one where that is scaled."""

@@ -44,6 +44,7 @@ def test_errors_hold_that_of_the_term():
     assert_allclose(with_term.dof, plain.dof - 1, atol=0.01)
 
 
+@pytest.mark.slow
 def test_pixel_phase_is_taken_off():
     """Waves of 0.03 px, by where a star falls on its pixel."""
     bent = sky(2, phase=0.03)
@@ -79,7 +80,13 @@ def test_a_term_takes_itself_away():
     assert "orbits: the positions do not show it" in str(alone)
 
 
-@pytest.mark.parametrize(("term", "bent"), [("acceleration", {"acceleration": 0.02}), ("orbits", {"orbits": 3.0})])
+@pytest.mark.parametrize(
+    ("term", "bent"),
+    [
+        pytest.param("acceleration", {"acceleration": 0.02}, marks=pytest.mark.slow),
+        pytest.param("orbits", {"orbits": 3.0}, marks=pytest.mark.slow),
+    ],
+)
 def test_stars_on_orbits_are_kept(term, bent):
     """They are named, and no other; their places at any time, and all others, are right within their errors."""
     field = sky(5, years=15.0, n_exposures=20, n_stars=40, **bent)
@@ -99,6 +106,7 @@ def test_stars_on_orbits_are_kept(term, bent):
     assert np.isnan(dropped.stars["x"][np.isin(dropped.stars["star"], field.odd)]).all()
 
 
+@pytest.mark.slow
 def test_a_term_of_ones_own(tmp_path):
     """Modes of each exposure with a known covariance, as of a deformable mirror at altitude; and written and read."""
     pattern = lambda at: np.sin(2 * np.pi * np.asarray(at)[..., ::-1] / 700.0)  # noqa: E731
@@ -134,6 +142,7 @@ def test_errors_are_scaled_with_the_others():
     assert_allclose(found.star_weights, stated.star_weights)
 
 
+@pytest.mark.slow
 def test_what_an_earlier_solution_took_off_is_there_again():
     field = sky(1, refraction=0.02)
     plain = field.solve()
@@ -279,14 +288,13 @@ def test_a_term_is_checked(given, said):
         ld.Term(**{"name": "a", "columns": lambda observed: observed.pixels[None], "numbers": ("n",)} | given)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bent", "terms"),
     [
-        ({"refraction": 0.02}, ["refraction"]),
-        ({"phase": 0.03}, ["pixel_phase"]),
-        ({"refraction": 0.02, "phase": 0.03}, ["refraction", "pixel_phase"]),
-        ({}, ["refraction", "pixel_phase"]),
+        pytest.param({"refraction": 0.02}, ["refraction"], marks=pytest.mark.sets),
+        pytest.param({"phase": 0.03}, ["pixel_phase"], marks=pytest.mark.sets),
+        pytest.param({"refraction": 0.02, "phase": 0.03}, ["refraction", "pixel_phase"], marks=pytest.mark.slow),
+        pytest.param({}, ["refraction", "pixel_phase"], marks=pytest.mark.slow),
     ],
 )
 def test_errors_are_calibrated(bent, terms):
@@ -303,6 +311,7 @@ def test_errors_are_calibrated(bent, terms):
     assert np.all(there == 1) if bent else np.all(there <= 0.1)
 
 
+@pytest.mark.slow
 def test_accelerations_in_one_word():
     """The same as motions and the term, beside other terms too."""
     bent = sky(11, acceleration=0.02, n_stars=30, n_exposures=12, years=15.0)
@@ -322,8 +331,13 @@ def test_accelerations_in_one_word():
         bent.solve(motion="accelerations")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("bent", [{"acceleration": 0.01}, {"orbits": 3.0}])
+@pytest.mark.parametrize(
+    "bent",
+    [
+        pytest.param({"acceleration": 0.01}, marks=pytest.mark.slow),
+        pytest.param({"orbits": 3.0}, marks=pytest.mark.sets),
+    ],
+)
 def test_orbits_are_calibrated(bent):
     """Every star on one is named in every set, false names are rare, and places at three times have right errors."""
     named, false, others, odd_ones = 0, 0, [], []

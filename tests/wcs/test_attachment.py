@@ -120,12 +120,12 @@ def wcs_in(path, number=1):
 @pytest.mark.parametrize(
     ("degree", "peak", "place"),
     [
-        (3, 5, {}),
-        (3, 20, {"lat": 89.9, "lon": 123.0}),
-        (3, 100, {"lon": 0.0}),
-        (5, 5, {"lat": -89.9, "parity": 1}),
-        (5, 20, {"lon": 0.0, "turn": 170.0}),
-        (5, 100, {"lat": -60.0, "parity": 1}),
+        pytest.param(3, 5, {}, marks=pytest.mark.slow),
+        pytest.param(3, 20, {"lat": 89.9, "lon": 123.0}, marks=pytest.mark.slow),
+        pytest.param(3, 100, {"lon": 0.0}, marks=pytest.mark.slow),
+        pytest.param(5, 5, {"lat": -89.9, "parity": 1}, marks=pytest.mark.slow),
+        pytest.param(5, 20, {"lon": 0.0, "turn": 170.0}, marks=pytest.mark.slow),
+        pytest.param(5, 100, {"lat": -60.0, "parity": 1}, marks=pytest.mark.slow),
     ],
 )
 def test_every_form_gives_the_same_sky(geometry, tmp_path, degree, peak, place):
@@ -484,6 +484,7 @@ def test_detectors_one_by_one(geometry, mosaic):
     assert names_in(mosaic) == ["PRIMARY", "SCI", "SCI", "ASDF", "ASDF"]
 
 
+@pytest.mark.slow
 def test_errors_and_flags_get_the_wcs_of_their_image(geometry, tmp_path):
     """Of two detectors, each to its own by EXTVER; not what has another shape or is another image."""
     solution = geometry(1, 2.0, shape=SHAPE, names=("night_SCI1", "night_SCI2"))
@@ -612,7 +613,7 @@ def test_head_files_of_packed_frames(one, tmp_path):
     assert repr(item).endswith("px>")
 
 
-@pytest.mark.parametrize("in_place", [True, False])
+@pytest.mark.parametrize("in_place", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_old_texts_beside_new_headers_are_named(geometry, tmp_path, in_place):
     """SWarp would read the old header; nobody is warned of the texts of others, or of those that are written now."""
     names = [f"f{k}" for k in range(5)]
@@ -651,6 +652,7 @@ def test_one_image_under_two_names(geometry, mosaic):
 # --- refusals, with nothing written ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_nothing_is_written_unless_all_can_be(geometry, tmp_path):
     good = geometry(3, 2.0, shape=SHAPE, names=("frame", "other"))
     coefficients = good.coefficients.copy()
@@ -928,7 +930,7 @@ def check_nothing_happened(solution, paths, folder, before):
     assert everything(folder).keys() == before.keys()
 
 
-@pytest.mark.parametrize("good", [0, 1, 2])
+@pytest.mark.parametrize("good", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 def test_frames_are_changed_all_or_none(three, tmp_path, monkeypatch, good):
     solution, paths = three
     before, usual, written = everything(tmp_path), attachment._Plan.write, []
@@ -946,6 +948,7 @@ def test_frames_are_changed_all_or_none(three, tmp_path, monkeypatch, good):
     check_nothing_happened(solution, paths, tmp_path, before)
 
 
+@pytest.mark.slow
 def test_a_disk_that_fails_between_two_files(three, tmp_path, monkeypatch):
     """Those that were replaced come back, in whatever folder."""
     solution, paths = three
@@ -963,6 +966,7 @@ def test_a_disk_that_fails_between_two_files(three, tmp_path, monkeypatch):
     check_nothing_happened(solution, paths, tmp_path, before)
 
 
+@pytest.mark.slow
 def test_copies_come_together_beside_other_files(three, tmp_path, monkeypatch):
     """Of a folder of the user's own everything else stays, and a failure changes nothing."""
     solution, paths = three
@@ -988,6 +992,7 @@ def test_copies_come_together_beside_other_files(three, tmp_path, monkeypatch):
     assert all(map(has_wcs, out.glob("*.fits")))
 
 
+@pytest.mark.slow
 def test_what_is_unknown_of_the_sky_and_maps_left_behind_are_said(tmp_path, caplog):
     """One line with the largest move of a star by 1 px of what is unknown; none where a prior determines all."""
     night = legdistort.simulate_exposures(small=True, n_exposures=4, seed=4)

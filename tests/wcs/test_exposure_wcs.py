@@ -92,6 +92,7 @@ def test_sky_is_that_of_the_tangent_plane(solution):
         assert_allclose(back, inside, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_whole_chain_backward_without_the_box(solution):
     for name in solution.names:
         wcs, p = solution[name].wcs, detector_points(solution, name)
@@ -328,6 +329,7 @@ def evaluate(wcs, seed):
     return np.array([*reference, *wcs.get_transform("reference", "detector")(*reference), *wcs(*p)])
 
 
+@pytest.mark.slow
 def test_eight_threads_agree(solution):
     wcs = solution[solution.names[1]].wcs
     expected = [evaluate(wcs, seed) for seed in range(4)]

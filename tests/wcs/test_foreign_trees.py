@@ -58,6 +58,7 @@ def yaml_of(content):
     return content[: content.index(b"\n...") + 5].decode()
 
 
+@pytest.mark.slow
 def test_asdf_files_of_roman(night, tmp_path):
     paths, solution = night
     path, name = tmp_path / paths[0].name, solution.names[0]
@@ -83,6 +84,7 @@ def test_asdf_files_of_roman(night, tmp_path):
     assert_allclose(read.wcs(3.0, 4.0), solution[name].wcs(3.0, 4.0), rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_data_models_of_jwst(night, tmp_path):
     asdf_in_fits = pytest.importorskip("stdatamodels.asdf_in_fits")
     paths, solution = night
@@ -115,6 +117,7 @@ def test_data_models_of_jwst(night, tmp_path):
     assert len(path.read_bytes()) == len(again)
 
 
+@pytest.mark.slow
 def test_a_file_of_the_archive_after_tweakreg(shared_data, tmp_path, caplog):
     path = tmp_path / "jw.fits"
     content = (shared_data / "jwst_nrcalong" / "jw01227_nrcalong_f444w_cutout.fits").read_bytes()
@@ -147,6 +150,7 @@ def test_a_file_of_the_archive_after_tweakreg(shared_data, tmp_path, caplog):
     assert np.abs(off).max() < 0.02
 
 
+@pytest.mark.slow
 def test_by_how_much_corners_move_is_said_once(night, tmp_path, caplog):
     paths, solution = night
     with caplog.at_level("INFO", "legdistort"):
@@ -181,6 +185,7 @@ def test_a_model_that_cannot_be_refined_is_named(night, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_catalogues_with_the_wcs_of_their_images(night, tmp_path, capsys):
     """Lists as `photutils` writes them beside the images of a pipeline: sky, shape and time are those of the images."""
     from legdistort.cli import main

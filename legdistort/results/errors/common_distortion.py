@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...geometry import detector_modes
+from ...geometry import basis, detector_modes
 from . import absolute_errors
 from .coefficient_covariance import mean_covariance
 
@@ -25,7 +25,7 @@ def common_distortion(solution, n):
         Responses to the errors of the camera.
     """
     gauge, uncertainty = solution.gauge, solution.estimate.uncertainty
-    size = solution.coefficients.shape[2]
+    size = basis.n_modes(solution.degree)
     camera = uncertainty.camera
     shared = np.zeros((2 * size, 0)) if camera is None else camera.coefficients.mean(axis=0)
     if gauge.tie is None:
@@ -35,8 +35,9 @@ def common_distortion(solution, n):
     covariance = mean_covariance(uncertainty.coefficients, len(solution.names)) + unknown.T @ unknown
     covariance += moved @ absolute_errors.known_covariance(gauge) @ moved.T
     rows = np.kron(np.eye(2), np.eye(n, size))
-    mean = solution.coefficients[:, :, :size].mean(axis=0)
-    return rows @ mean.ravel(), rows @ covariance @ rows.T, rows @ shared
+    mean = np.zeros((2, n))  # beyond that degree what was given
+    mean[:, : solution.coefficients.shape[2]] = solution.coefficients[:, :, :n].mean(axis=0)
+    return mean.ravel(), rows @ covariance @ rows.T, rows @ shared
 
 
 def with_common_map(camera, solution):
@@ -57,4 +58,7 @@ def with_common_map(camera, solution):
     sigma = np.sqrt(variance) if n_exposures > 1 else np.full(len(rows), np.inf)
     sigma = np.where(sigma < _UNKNOWN, sigma, np.inf)
     widths = np.max(np.where(rows != 0, sigma[:, None], 0), axis=0, initial=0).reshape(2, n)
+    fitted = basis.n_modes(solution.degree)
+    if camera.common_sigma is not None:
+        widths[:, fitted:] = basis.change_degree(camera.common_sigma, basis.degree_of(n))[:, fitted:]
     return replace(camera, common_map=np.where(np.isinf(widths), 0, mean.reshape(2, n)), common_sigma=widths)
