@@ -491,16 +491,10 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
 
 def _identified(fit, reference, pixel_scale):
     """The stars of a reference that a fit has, `legdistort.matching.cross_identification.Identified`."""
-    matches = fit.matches
+    matches, places = fit.matches, np.where(fit.blocks.v[0] > 0, fit.result.state.positions, np.nan).T
+    known = {"flux": matches.observations.flux, "sky": matches.sky, "pixel_scale": pixel_scale}
     try:
-        return identify(
-            reference,
-            matches.stars,
-            np.where(fit.blocks.v[0] > 0, fit.result.state.positions, np.nan).T,
-            flux=matches.observations.flux,
-            sky=matches.sky,
-            pixel_scale=pixel_scale,
-        )
+        return identify(reference, matches.stars, places, **known)
     except InputError as error:
         raise InputError(f"{error}{bent_reference.or_detectors(fit) if reference.star is None else ''}") from None
 

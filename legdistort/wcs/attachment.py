@@ -14,7 +14,6 @@ from pathlib import Path
 import asdf
 import numpy as np
 from astropy.io import fits
-from astropy.wcs import WCS
 
 from ..exceptions import ExportError, InputError, some_of, without_astropy_warnings
 from ..inputs import detector_files, exposure_files, exposure_names, file_images
@@ -28,7 +27,7 @@ from ..runtime.checks import first_line
 from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read_bytes, readable, splice
 from ..runtime.outputs import replacing, replacing_files, replacing_folder
 from ..runtime.progress import Bar
-from .fits_headers import header_error
+from .fits_headers import header_error, misleading_cards
 from .flux_cards import FluxCards
 from .footprints import former_wcs, renewed_footprint
 from .foreign_trees import model_wcs, refined_tree, table_of
@@ -437,7 +436,7 @@ def _check_written(written, stated, view, path):
             if all(error <= value for error, value in zip(errors, promised, strict=True)):
                 return
             found = f"{max(errors):.2g} px off"
-        cards = ", ".join(_misleading(header, stated)) or "other cards"
+        cards = ", ".join(misleading_cards(header, stated)) or "other cards"
     raise ExportError(
         f"{path}: with {cards} in the header the WCS written is read as another one ({found}): remove these cards, or "
         "attach the exact WCS alone, kind=None (--asdf-only)"
@@ -452,25 +451,6 @@ def _readable_cards(written):
             card.verify("silentfix")
             cards.append(fits.Card(card.keyword, card.value, card.comment))
     return fits.Header(cards)
-
-
-def _misleading(header, stated):
-    """The keywords without one of which a header has the WCS that is stated."""
-    points = np.stack(np.meshgrid(*([0.0, 100.0, 300.0],) * 2), axis=-1).reshape(-1, 2)
-
-    def on_sky(cards):
-        try:
-            return WCS(cards).celestial.all_pix2world(points, 0)
-        except Exception:  # wcslib raises many kinds
-            return np.full_like(points, np.nan)
-
-    right, found = on_sky(stated), []
-    for key in dict.fromkeys(header):
-        less = header.copy()
-        less.remove(key, ignore_missing=True, remove_all=True)
-        if key not in stated and key and np.allclose(on_sky(less), right, rtol=0, atol=1e-9):
-            found.append(key)
-    return found
 
 
 def _number(hdulist, hdu):

@@ -257,3 +257,22 @@ def _round_up(value):
         return value
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)
     return float(f"{math.ceil(value / unit) * unit:.1e}")
+
+
+def misleading_cards(header, stated):
+    """The keywords without one of which a header has the WCS that is stated."""
+    points = np.stack(np.meshgrid(*([0.0, 100.0, 300.0],) * 2), axis=-1).reshape(-1, 2)
+
+    def on_sky(cards):
+        try:
+            return WCS(cards).celestial.all_pix2world(points, 0)
+        except Exception:  # wcslib raises many kinds
+            return np.full_like(points, np.nan)
+
+    right, found = on_sky(stated), []
+    for key in dict.fromkeys(header):
+        less = header.copy()
+        less.remove(key, ignore_missing=True, remove_all=True)
+        if key not in stated and key and np.allclose(on_sky(less), right, rtol=0, atol=1e-9):
+            found.append(key)
+    return found

@@ -136,7 +136,7 @@ def _static(solution, problem, state, each):
         scatter = found.sizes[model.degrees - 1 + (model.degrees.max() if model.n_nights else 0)]
     power, directions = np.linalg.eigh(covariance)
     told = power < _KNOWN**2
-    covariance = directions * np.where(told, power, FREE**2) @ directions.T + np.diag(scatter**2)
+    covariance = directions * np.where(told, power, FREE**2) @ directions.T + scatter**2 * np.eye(len(rows))
     covariance = rows.T @ covariance @ rows
     out = problem.prior_mean[0].copy()
     step = directions[:, told] @ (directions[:, told].T @ found.mean[mine])
