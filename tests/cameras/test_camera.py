@@ -170,7 +170,7 @@ class TestCamera:
             ({"layout": np.eye(3)}, "layout must be"),
             ({"shape": (1, 5)}, "shape must be"),
             ({"static": np.full((2, 10), np.nan)}, "coefficients must be finite"),
-            ({"static_sigma": -1}, "static_sigma must not be negative or NaN"),
+            ({"static_sigma": -1}, "static_sigma must be 0 or more"),
             ({"layout_sigma": [1, 2]}, "layout_sigma must be"),
             ({"static": legdistort.Prior(np.zeros((2, 10)), shape=(9, 9))}, "prior is for a detector of shape"),
         ],

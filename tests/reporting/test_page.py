@@ -340,8 +340,8 @@ def test_file_is_written_once(tmp_path, solution, monkeypatch):
     assert path.read_text(encoding="utf-8") == "first ✓"
     report.write_report(str(path), solution, overwrite=True)
     assert path.read_text(encoding="utf-8") == "second"
-    with pytest.raises(InputError, match="does not exist"):
-        report.write_report(tmp_path / "nowhere" / "report.html", solution)
+    made = report.write_report(tmp_path / "folder" / "report.html", solution)
+    assert made.read_text(encoding="utf-8") == "second"
     for files in ([("a", "b")], "stars.ecsv", [1]):
         with pytest.raises(InputError, match="files must be names of results"):
             report.write_report(path, solution, files=files, overwrite=True)
