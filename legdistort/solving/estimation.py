@@ -495,7 +495,7 @@ def _estimate(matches, options):
 def _tell_of_prior(matches, prior, degree):
     """Say what the default of the degree leaves of a prior of a higher one; warn of an unused distortion of headers."""
     each = prior.values() if isinstance(prior, dict) else [prior]
-    highest = max((p.degree for p in each if p is not None and p.states_mean), default=0)
+    highest = max((p.degree for p in each if isinstance(p, Prior) and p.states_mean), default=0)
     if isinstance(degree, Unasked) and highest > degree:
         log.info(
             "exposures are fitted to degree %d, the default: what the prior has beyond, up to degree %d, is held as "
