@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 from scipy import linalg, sparse
 
+from ..cameras.stated_errors import FREE
 from ..solving.gauge.dynamic_scatter import CHANCE, TAILS
 from ..solving.knowledge.exposures import RANGE
 from ..solving.knowledge.factors import GIVEN, Factor
@@ -15,7 +16,6 @@ from .known_maps import DETERMINED
 
 #: A drift, of two sizes, is kept if it makes twice the logarithm of the likelihood larger by so much.
 KEPT = 6.0
-_FREE = 1e3  # width of what nothing is known of [pix]
 _EXACT = 1e-6  # scatter of one night, of which nothing tells [pix]
 _MOST, _FEWEST = 600, 12  # unknowns from which sizes are found, and nights, if there are as many
 _ROUNDS, _SETTLED = 20, 0.02
@@ -110,7 +110,7 @@ class Chain:
 
     def _found(self, date, information, pull):
         size = self.pull.shape[1]
-        known = np.full(size, _FREE**-2.0)
+        known = np.full(size, FREE**-2.0)
         if self.rate:
             known = np.append(known, np.full(size, self.rate**-2.0))
         covariance, seen = np.linalg.inv(information + np.diag(known)), self._seen(date)
@@ -241,7 +241,7 @@ def _model(nights, dates, degrees, drifts):
             for block, count in zip(blocks, counts, strict=False)
         ]
         all_rows = sparse.hstack(blocks, format="csr")
-        parts.append(Factor("nights", all_rows, value, np.full(len(value), _FREE), size, stretch))
+        parts.append(Factor("nights", all_rows, value, np.full(len(value), FREE), size, stretch))
 
     own = sparse.csr_array((-np.ones(n), (range(n), place)), (n, m))
     away = np.concatenate([each[0] - nights[0][0] for each in nights])

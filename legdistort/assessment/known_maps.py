@@ -8,6 +8,7 @@ from scipy import special
 
 from ..cameras.camera import Camera
 from ..cameras.detector import map_alone, widths_alone
+from ..cameras.stated_errors import FREE
 from ..exceptions import InputError
 from ..geometry import basis, detector_modes
 from ..geometry.similarity import apply, invert
@@ -28,7 +29,6 @@ from ..solving.options import SolveOptions
 MEAN_SQUARE = 8
 #: Information [pix^-2] from which a direction is determined: its error is 0.3 px at most, rms per axis over a detector.
 DETERMINED = 1 / (MEAN_SQUARE * 0.3**2)
-_FREE = 1e3  # error of a coefficient of which nothing is known where digits count [pix]
 _ROUNDS = 3
 _KEPT = "loss", "motion", "motion_sigma", "motion_epoch", "night_sigma"  # settings of a night
 _MOST = 500  # coefficients from which the scatter of exposures is found
@@ -309,7 +309,7 @@ def _shown(fit):
         keep = drawn(problem.detectors, most // (2 * problem.n_modes))
         part = part_of(problem, state, keep)
         model = ExposureModel.of(*part, fit.result.gauge.all_motion[keep], np.zeros(len(keep), dtype=int))
-        free = model.statics(width=_FREE)
+        free = model.statics(width=FREE)
         return model, free, Factor.joined([model.departures, free])
 
     model, _, factor = known(_MOST)

@@ -27,10 +27,7 @@ def as_widths(value, n, name):
     """
     if value is None:
         return None
-    try:
-        out = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be widths in pixels, got {value!r}") from None
+    out = _numbers(value, f"{name} must be widths in pixels")
     try:
         out = np.broadcast_to(out, (2, n)).copy()
     except ValueError:
@@ -52,10 +49,7 @@ def as_covariance(value, n, name):
     """
     if value is None:
         return None
-    try:
-        out = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be numbers, a covariance in px^2, got {value!r}") from None
+    out = _numbers(value, f"{name} must be numbers, a covariance in px^2")
     if out.shape != (2 * n, 2 * n):
         raise InputError(f"{name} must be a covariance of shape ({2 * n}, {2 * n}) in px^2, got shape {out.shape}")
     unknown = np.isposinf(np.diag(out))
@@ -70,6 +64,14 @@ def as_covariance(value, n, name):
         raise InputError(f"{name} must be a covariance in px^2, and gives a combination a negative variance")
     out[unknown, unknown] = np.inf
     return out
+
+
+def _numbers(value, wanted):
+    """An array of our own; `InputError` with what is wanted for what is none."""
+    try:
+        return np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"{wanted}, got {value!r}") from None
 
 
 def as_errors(widths, covariance, n, names):

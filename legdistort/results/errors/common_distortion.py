@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...cameras.stated_errors import UNKNOWN
 from ...geometry import basis, detector_modes
 from . import absolute_errors
 from .coefficient_covariance import mean_covariance
 
-#: Error [pix] of a coefficient of which nothing is known, and where its width counts as infinite.
-NOTHING, _UNKNOWN = 1e4, 100.0
+#: Error [pix] of a coefficient of which nothing is known.
+NOTHING = 1e4
 
 
 def common_distortion(solution, n):
@@ -56,7 +57,7 @@ def with_common_map(camera, solution):
         scatter = solution.coefficients.reshape(n_exposures, -1) @ rows.T
         variance += scatter.var(axis=0, ddof=1) / n_exposures
     sigma = np.sqrt(variance) if n_exposures > 1 else np.full(len(rows), np.inf)
-    sigma = np.where(sigma < _UNKNOWN, sigma, np.inf)
+    sigma = np.where(sigma < UNKNOWN, sigma, np.inf)
     widths = np.max(np.where(rows != 0, sigma[:, None], 0), axis=0, initial=0).reshape(2, n)
     fitted = basis.n_modes(solution.degree)
     if camera.common_sigma is not None:
