@@ -15,7 +15,7 @@ posterior of a linear model in numpy, which knows the width of what changes from
 import argparse
 import logging
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 
@@ -221,6 +221,7 @@ def settings():
     none = lambda *_: {}  # noqa: E731
     exact = lambda m, s, c, r: {"prior": as_prior(c, r)}  # noqa: E731
     stated = lambda m, s, c, r: {"prior": as_prior(c, r, WIDTHS)}  # noqa: E731
+    alike = lambda *a: {"prior": replace(stated(*a)["prior"], sigma="evidence")}  # noqa: E731
     sized = lambda *_: {"prior": ld.Prior(None, static_sigma=DECLARED)}  # noqa: E731
     fit = lambda *_: {"static": "fit"}  # noqa: E731
     auto = lambda *_: {"degree": "auto"}  # noqa: E731
@@ -239,6 +240,7 @@ def settings():
         "no prior, two detectors": ({"n_detectors": 2}, none),
         "prior, exact": ({}, exact),
         "prior with static_sigma": ({}, stated),
+        "prior with static_sigma, exposures alike": ({"dynamic": 0.0}, alike),
         "size declared": ({"declared": DECLARED}, sized),
         "static='fit', no rolls": ({"dynamic": 0.0, "dither": 300.0}, fit),
         "static='fit', rolls": ({"dynamic": 0.0, "dither": 300.0, "rolls": True}, fit),

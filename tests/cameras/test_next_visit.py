@@ -201,7 +201,7 @@ def test_directions_that_are_not_determined_are_named(night):
 
 @pytest.mark.slow
 def test_absolute_errors_of_the_next_visit():
-    """Of the stars after a similarity: stated ones are some 15 % small."""
+    """Of the stars after a similarity: what the reference may be bent by, which it is not, is in those stated."""
     squares = np.zeros(2)
     for seed in range(5, 11):
         night = drawn(seed)
@@ -209,4 +209,4 @@ def test_absolute_errors_of_the_next_visit():
         second = ld.solve(matched(night, 1, first.camera), prior=EVIDENCE)
         stated = [second.stars[name].value for name in ("x_err_abs", "y_err_abs")]
         squares += off_sky(night, second)[2] ** 2, np.mean(np.square(stated))
-    assert 0.9 < squares[0] / squares[1] < 1.6
+    assert 0.5 < squares[0] / squares[1] < 1.2

@@ -12,6 +12,7 @@ import relative_errors_table
 import legdistort as ld
 from legdistort.exceptions import InputError, LegdistortWarning
 from legdistort.results import accuracy
+from legdistort.results.errors import absolute_errors
 
 pytestmark = pytest.mark.filterwarnings(
     f"ignore::{LegdistortWarning.__module__}.{LegdistortWarning.__qualname__}"  # what is not known is known here
@@ -63,6 +64,18 @@ def test_the_error_of_the_common_map_is_what_it_adds_to_stars(name):
     assert solution.gauge.absolute_error == pytest.approx(np.sqrt(np.nanmean(absolute - relative)), rel=0.1)
     apart = np.sqrt(np.nansum([error**2 for *_, error in solution.gauge.absolute_errors()]))
     assert apart > 1.1 * solution.gauge.absolute_error
+
+
+@pytest.mark.parametrize("departures", [0.0, 0.4])
+def test_an_error_of_the_static_distortion_moves_stars_as_it_stands(departures):
+    """However little exposures scatter about it: widths hold them together, and nothing holds the plane."""
+    simulating, solving = table.settings()["prior with static_sigma, exposures alike"]
+    matches, sky, common = table.simulated(1, **simulating | {"n_exposures": 4, "dynamic": departures})
+    solution = ld.solve(matches, **solving(matches, sky, common, np.random.default_rng(1)))
+    assert (np.max(solution.diagnostics.widths) < 1e-3) == (departures == 0)
+    moved = np.sqrt(np.mean(solution.gauge.directions**2, axis=(0, 1)))
+    plain = absolute_errors.plain_directions(solution.gauge, solution.estimate.positions, solution.gauge.n_modes)
+    assert moved == pytest.approx(np.sqrt(np.mean(plain**2, axis=(0, 1))), rel=0.1)
 
 
 def test_known_offsets_are_those_after_a_similarity_where_all_is_known():
@@ -147,10 +160,11 @@ def test_constraints_do_not_follow_the_state_away():
         ("no prior, no dithers", 11, 30, 0.15),
         ("static='fit', no rolls", 11, 30, 0.15),
         ("no prior, rolls", 4, 60, 0.25),
+        ("prior with static_sigma, exposures alike", 4, 80, 0.4),
     ],
 )
 def test_absolute_errors_are_calibrated(name, n_exposures, n_sets, tolerance):
-    """Standard errors of the ratios: 0.03, 0.03 and 0.1."""
+    """Standard errors of the ratios: 0.03, 0.03, 0.1 and 0.13."""
     assert table.row(name, n_sets, n_exposures=n_exposures).ratio == pytest.approx(1, abs=tolerance)
 
 

@@ -4,7 +4,7 @@ How far single exposures depart from the static distortion is mostly not known. 
 poses integrated out, the data are Gaussian with a covariance that depends on the variance of the modes of each degree,
 and the widths that make the data most likely are taken (MacKay 1992; in mixed models, restricted maximum likelihood).
 Modes that the data do not determine, and maps common to all exposures, do not enter it, so it works where an exposure
-has fewer stars than modes.
+has fewer stars than modes. Nor does a static distortion that is off by what is stated of its error.
 """
 
 import logging
@@ -15,10 +15,12 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
+from ...cameras.stated_errors import FREE
 from ...exceptions import ConvergenceWarning, warn
 from ...geometry import basis, detector_modes
 from ...priors.prior import Prior
 from ..equations.problem import by_exposure
+from ..knowledge.exposures import stated
 from ..knowledge.reduced_data import drawn, part_of, reduced_data
 
 log = logging.getLogger(__name__)
@@ -158,6 +160,9 @@ def _sample(problem, state, labels, motion):
 class Evidence:
     """The data as the widths see them: stars, poses and all that has widths of its own eliminated.
 
+    The coefficients are departures of exposures from their static distortion, then what that departs by from the mean
+    of its prior, in its stated errors: these have the width 1.
+
     Up to a constant, twice the logarithm of the likelihood of widths ``w`` is
     ``p' W (1 + W S W)^-1 W p - log det(1 + W S W)``, with ``W = diag(w)``.
 
@@ -168,7 +173,7 @@ class Evidence:
     pull : ndarray, shape (n,)
         p, the gradient at the prior mean.
     label : ndarray of int, shape (n,)
-        Number of the width of every coefficient.
+        Number of the width of every coefficient; that after the last one for those of static distortions.
     chi2 : float
         J at the prior mean.
     n_data : int
@@ -187,7 +192,7 @@ class Evidence:
         The gradient vanishes where the square of a width is the sum of the squares of its coefficients over the number
         of them that the data determine: the fixed point of MacKay (1992).
         """
-        w = np.exp(log_widths)[self.label]
+        n, w = len(log_widths), np.exp(np.append(log_widths, 0.0))[self.label]
         root, lower = cho_factor(np.eye(len(w)) + w[:, None] * self.curvature * w, lower=True)
         inverse = cho_solve((root, lower), np.eye(len(w)))
         mean = inverse @ (w * self.pull)  # of the coefficients given the data, in their widths
@@ -197,7 +202,7 @@ class Evidence:
             left = max(self.chi2 - explained, 1e-12 * self.chi2)
             gain, per_square = self.n_data / 2 * np.log(left), self.n_data / left
         slope = (1 - np.diag(inverse)) - per_square * mean**2
-        return gain + np.log(np.diag(root)).sum(), np.bincount(self.label, slope, len(log_widths))
+        return gain + np.log(np.diag(root)).sum(), np.bincount(self.label, slope, n)[:n]
 
     def best(self, n, bounds, *, scale=False):
         """The n widths of the highest likelihood between two bounds; at the lower one where another gains little.
@@ -214,8 +219,9 @@ class Evidence:
         ndarray, shape (n,)
         """
         low, high = np.log(bounds)
-        square = np.bincount(self.label, (self.pull / np.diag(self.curvature)) ** 2, n)
-        unit = square / np.bincount(self.label, minlength=n)  # variances of that order: where 0 is left if it has to be
+        own = self.label < n
+        square = np.bincount(self.label[own], (self.pull[own] / np.diag(self.curvature)[own]) ** 2, n)
+        unit = square / np.bincount(self.label[own], minlength=n)  # variances of that order: where 0 is left if it has to be
         dropped = np.zeros(n, dtype=bool)
 
         def cost(variance):
@@ -268,4 +274,24 @@ def evidence(problem, state, labels, motion):
         label.append(labels[i, degree[sought] - 1])
         origin.append(mine @ departure[i, :, :n].ravel())
     data = reduced_data(problem, state, np.concatenate(rows), motion).at(-np.concatenate(origin))
-    return Evidence(data.curvature, data.pull, np.concatenate(label), data.chi2, data.n_data)
+    statics = np.concatenate(_statics(problem, wanted)[:, sought])
+    both = np.hstack([np.eye(len(data.pull)), statics])
+    label.append(np.full(statics.shape[1], labels.max() + 1))
+    return Evidence(both.T @ data.curvature @ both, both.T @ data.pull, np.concatenate(label), data.chi2, data.n_data)
+
+
+def _statics(problem, wanted):
+    """Static distortions of the exposures (k,) that are wanted, in units of their stated errors, (k, K, n).
+
+    None where nothing is stated: widths about no mean have the size of the static distortion, and a fit about none that
+    held exposures closer would leave them out (see `legdistort.solving.single_fit.estimate`).
+    """
+    _, spread, group, _ = stated(problem)
+    out = [np.zeros((np.count_nonzero(wanted), spread.variance.shape[1], 0))]
+    if problem.errors_of_statics.knows_nothing:
+        return out[0]
+    for g in np.unique(group[wanted]):
+        free = spread.variance[g] > 0
+        columns = spread.directions[g][:, free] * np.sqrt(np.minimum(spread.variance[g][free], FREE**2))
+        out.append((group[wanted] == g)[:, None, None] * columns)
+    return np.concatenate(out, axis=2)

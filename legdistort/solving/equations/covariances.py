@@ -193,8 +193,8 @@ class Uncertainty:
 
     @property
     def _moving(self):
-        """The reduced system in which maps move the plane; widths about a mean that is not known move along."""
-        if not self._problem.floats:
+        """The reduced system in which maps move the plane; widths about a mean that is not exact move along."""
+        if self._problem.prior_sigma is None or self._gauge.static == "exact":
             return self.system
         problem, blocks = replace(self._problem, prior_sigma=None), replace(self._blocks, u=self._blocks.u_data)
         with contextlib.suppress(SolveError):  # exposures of few stars have widths alone
