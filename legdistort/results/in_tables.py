@@ -272,6 +272,13 @@ def _common_stars(camera, table):
     return f"stars used on both of two detectors: {some_of(listed, 6)}" if listed else ""
 
 
+def goodness(fit):
+    """Chi2 of a solution, or of a fit, in words."""
+    if fit.dof < 0.5:
+        return "as many unknowns as data, which nothing tests"
+    return f"chi2 {fit.chi2:.1f} for {fit.dof:.0f} degrees of freedom"
+
+
 def printed(solution):
     """What `print` shows: verdict, facts, a row for every exposure."""
     used, motions = solution.residuals["used"], solution.estimate.motions

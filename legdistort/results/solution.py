@@ -325,10 +325,7 @@ class Solution(ShownAsPrinted):
         lost = np.count_nonzero(np.isnan(self.estimate.positions[:, 0]))
         stars = f"{len(self.estimate.star_names)} stars{f' ({lost} without a position)' if lost else ''}"
         exposures = f"{len(self.names)} exposure{'s' * (len(self.names) != 1)}"
-        return (
-            f"<Solution: {exposures}, {stars}, degree {self.degree}, "
-            f"chi2 {self.chi2:.1f} for {self.dof:.0f} degrees of freedom>"
-        )
+        return f"<Solution: {exposures}, {stars}, degree {self.degree}, {in_tables.goodness(self)}>"
 
     def __str__(self) -> str:
         return in_tables.printed(self)

@@ -20,6 +20,7 @@ from ..matching.matches import Matches
 from ..priors.prior import UNSTATED, Prior, has_distortion
 from ..results.diagnostics import Diagnostics
 from ..results.errors.common_distortion import with_common_map
+from ..results.in_tables import goodness
 from ..results.gauge import warning_of
 from ..results.settings import Settings
 from ..runtime.guards.units import plain_numbers
@@ -535,8 +536,7 @@ def _choose_degree(matches, options):
 
 def _tell(fit, matches):
     """Log how the fit ended and what it left out, and warn of what these exposures cannot determine."""
-    left = f"chi2 {fit.chi2:.1f} for {fit.dof:.0f} degrees of freedom" if fit.dof > 0.5 else "as many unknowns as data"
-    log.info("%s; %s", fit.result.status, left)
+    log.info("%s; %s", fit.result.status, goodness(fit))
     _tell_lost_exposures(fit, matches)
     _tell_lost_stars(fit)
     fields = None if fit.tabled is None else fit.tabled.errors

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.table import Table
 from numpy.testing import assert_allclose
 
 import legdistort
@@ -83,6 +84,14 @@ def test_all_errors_are_caught_by_one_name():
         if inspect.isclass(thing) and thing.__module__ == exceptions.__name__:
             assert issubclass(thing, (LegdistortError, LegdistortWarning)), name
             assert thing.__doc__
+
+
+def test_a_fit_that_nothing_tests_says_so():
+    """Two stars in two exposures: chi2 is 0 by the number of unknowns."""
+    xy = {"x": [10.0, 80.0, 20.0, 90.0], "y": [10.0, 70.0, 15.0, 75.5]}
+    table = Table({"exposure": list("aabb"), "star": [0, 1, 0, 1]} | xy | dict.fromkeys(("x_err", "y_err"), [0.1] * 4))
+    solution = solve(Matches.from_table(table, shape=(100, 100)), degree=0)
+    assert repr(solution).endswith("degree 0, as many unknowns as data, which nothing tests>")
 
 
 def test_nouns_explain_themselves(simulation, solution):
