@@ -20,8 +20,8 @@ from ..matching.matches import Matches
 from ..priors.prior import UNSTATED, Prior, has_distortion
 from ..results.diagnostics import Diagnostics
 from ..results.errors.common_distortion import with_common_map
-from ..results.in_tables import goodness
 from ..results.gauge import warning_of
+from ..results.in_tables import goodness
 from ..results.settings import Settings
 from ..runtime.guards.units import plain_numbers
 from . import minimisers, model_forms, reference_tie, single_fit, star_motions
