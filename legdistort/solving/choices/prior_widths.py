@@ -20,6 +20,7 @@ from ...exceptions import ConvergenceWarning, warn
 from ...geometry import basis, detector_modes
 from ...priors.prior import Prior
 from ..equations.problem import by_exposure
+from ..gauge import most_probable
 from ..knowledge.exposures import stated
 from ..knowledge.reduced_data import drawn, part_of, reduced_data
 
@@ -121,7 +122,8 @@ def find_widths(fit, prior, degree, unit, *, scale=False):
     for _ in range(MAX_ROUNDS if degree else 0):
         done, caught = fitted()
         labels = _labels(widths, by_exposure(done.matches, prior))
-        seen = evidence(*_sample(done.weighted, done.result.state, labels, done.result.gauge.all_motion))
+        sample = _sample(done.weighted, done.result.state, labels, done.result.gauge.all_motion)
+        seen = evidence(*sample, free_mean=not done.matches.camera.has_focal_plane)
         before, found = widths.values, seen.best(widths.values.size, bounds, scale=scale).reshape(-1, degree)
         log.debug("widths by degree: %s px", found)
         if np.all(np.abs(found - before) <= TOLERANCE * np.maximum(found, unit)):
@@ -246,7 +248,7 @@ class Evidence:
         return np.sqrt(found.x * unit)
 
 
-def evidence(problem, state, labels, motion):
+def evidence(problem, state, labels, motion, *, free_mean=True):
     """The data of a fit as the widths see them.
 
     Parameters
@@ -260,6 +262,8 @@ def evidence(problem, state, labels, motion):
     motion : ndarray, shape (n_exposures, 2 n, 2 n)
         How maps of the reference plane change the coefficients (`legdistort.results.gauge.Gauge`); they are the
         null space of the data, along which the linear model follows the noise.
+    free_mean : bool
+        Whether the mean of a prior that is not exact follows what exposures show.
     """
     wanted = labels[:, 0] >= 0
     sigma = np.where(wanted[:, None, None], np.inf, problem.prior_sigma)
@@ -276,23 +280,22 @@ def evidence(problem, state, labels, motion):
         label.append(labels[i, degree[sought] - 1])
         origin.append(mine @ departure[i, :, :n].ravel())
     data = reduced_data(problem, state, np.concatenate(rows), motion).at(-np.concatenate(origin))
-    statics = np.concatenate(_statics(problem, wanted)[:, sought])
+    free_mean = free_mean and not problem.errors_of_statics.knows_nothing and most_probable.is_possible(problem)
+    statics = np.concatenate(_statics(problem, wanted, free_mean)[:, sought])
     both = np.hstack([np.eye(len(data.pull)), statics])
     label.append(np.full(statics.shape[1], labels.max() + 1))
     return Evidence(both.T @ data.curvature @ both, both.T @ data.pull, np.concatenate(label), data.chi2, data.n_data)
 
 
-def _statics(problem, wanted):
+def _statics(problem, wanted, free_mean):
     """Static distortions of the exposures (k,) that are wanted, in units of their stated errors, (k, K, n).
 
-    None where nothing is stated: widths about no mean have the size of the static distortion, and a fit about none that
-    held exposures closer would leave them out (see `legdistort.solving.single_fit.estimate`).
+    None where a fit holds exposures to the mean of the prior, or there is none: widths that have in them the error of
+    that mean, or the size of the distortion, are what lets exposures be where they are then.
     """
     _, spread, group, _ = stated(problem)
     out = [np.zeros((np.count_nonzero(wanted), spread.variance.shape[1], 0))]
-    if problem.errors_of_statics.knows_nothing:
-        return out[0]
-    for g in np.unique(group[wanted]):
+    for g in np.unique(group[wanted]) if free_mean else ():
         free = spread.variance[g] > 0
         columns = spread.directions[g][:, free] * np.sqrt(np.minimum(spread.variance[g][free], FREE**2))
         out.append((group[wanted] == g)[:, None, None] * columns)

@@ -223,7 +223,7 @@ class Uncertainty:
         See `directions`. A map that stays the same changes motions in second order, by its gradient, and one that
         changes with time the positions of stars that move.
         """
-        gauge, system, terms = self._gauge, self.system, self._problem.terms
+        gauge, system, terms = self._gauge, self._moving, self._problem.terms
         moved = np.stack([system.follow(d) for d in system.moves[: gauge.n_constraints]], axis=2)
         out = -(moved @ np.hstack([gauge.reach, gauge.drift_reach])).transpose(1, 0, 2)
         if terms.is_held and gauge.drift.n_tied:  # the motion that is most probable beforehand moves with the map
