@@ -229,6 +229,11 @@ def test_photutils(tmp_path):
     found.write(tmp_path / "found.ecsv")
     out = read_table(tmp_path / "found.ecsv", error=0.1)
     assert_allclose(np.sort(out["x"].value), [20.3, 50.1], atol=0.1)
+    assert_allclose(out["flux"], found["flux"])
+    listed = QTable({"xcentroid": [10.0], "ycentroid": [5.0], "segment_flux": [7.0], "segment_fluxerr": [0.5]})
+    listed.write(tmp_path / "segments.ecsv")
+    out = read_table(tmp_path / "segments.ecsv", error=0.1)
+    assert (out["flux"][0], out["flux_err"][0]) == (7, 0.5)
     fitted = PSFPhotometry(psf, (7, 7), aperture_radius=4)(image, init_params=QTable({"x": [20, 50], "y": [31, 12]}))
     fitted["flags"][1] = 8
     fitted.write(tmp_path / "fitted.ecsv", serialize_method="data_mask")
@@ -239,15 +244,16 @@ def test_photutils(tmp_path):
     assert out["flags"].tolist() == [0, Flag.NOT_CONVERGED]
 
 
-@pytest.mark.parametrize("total", [True, False])
-def test_a_catalogue_of_the_jwst_pipeline(tmp_path, total, recwarn):
+@pytest.mark.parametrize(("total", "isophotal"), [(True, True), (False, True), (True, False)])
+def test_a_catalogue_of_the_jwst_pipeline(tmp_path, total, isophotal, recwarn):
     """Of source_catalog: the flux of a star is the total one, else the isophotal; old places are no result."""
     flux, xy = np.array([3e-6, 2e-7, 5e-8]), np.array([[10.0, 20.0, 30.0], [5.0, 6.0, 7.0]])
     listed = QTable({"label": [1, 2, 3], "xcentroid": xy[0], "ycentroid": xy[1]})
     listed["sky_centroid"] = SkyCoord([80.1, 80.2, 80.3], [-69.1, -69.2, -69.3], unit="deg")
     if total:
         listed["aper_total_flux"], listed["aper_total_flux_err"] = flux * u.Jy, 0.01 * flux * u.Jy
-    listed["isophotal_flux"], listed["isophotal_flux_err"] = 0.9 * flux * u.Jy, 0.02 * flux * u.Jy
+    if isophotal:
+        listed["isophotal_flux"], listed["isophotal_flux_err"] = 0.9 * flux * u.Jy, 0.02 * flux * u.Jy
     listed["is_extended"] = [False, True, False]
     listed.write(tmp_path / "a_cat.ecsv")
     out = read_table(tmp_path / "a_cat.ecsv", error=0.02)

@@ -100,18 +100,21 @@ DIALECTS = (
         ("x_fit", "y_fit"),
         flags=_photutils_flags,
     ),
-    Dialect(
-        "the JWST pipeline",
-        {
-            "x": ("xcentroid",),
-            "y": ("ycentroid",),
-            "flux": ("aper_total_flux", "isophotal_flux"),
-            "flux_err": ("aper_total_flux_err", "isophotal_flux_err"),
-        },
-        ("xcentroid", "ycentroid", "isophotal_flux"),
+    *(
+        Dialect(
+            "the JWST pipeline",
+            {"x": ("xcentroid",), "y": ("ycentroid",), "flux": (flux,), "flux_err": (f"{flux}_err",)},
+            ("xcentroid", "ycentroid", flux),
+        )
+        for flux in ("aper_total_flux", "isophotal_flux")
     ),
-    Dialect("photutils", {"x": ("xcentroid",), "y": ("ycentroid",)}, ("xcentroid", "ycentroid")),
-    Dialect("photutils", {"x": ("x_centroid",), "y": ("y_centroid",)}, ("x_centroid", "y_centroid")),
+    *(
+        Dialect("photutils", {"x": (x,), "y": (y,), "flux": ("segment_flux",), "flux_err": error}, (x, y))
+        for x, y, error in (
+            ("xcentroid", "ycentroid", ("segment_fluxerr",)),
+            ("x_centroid", "y_centroid", ("segment_flux_err", "segment_fluxerr")),
+        )
+    ),
 )
 
 

@@ -68,7 +68,8 @@ def _fluxes(matches):
     if np.count_nonzero(known) < FEWEST:
         raise InputError(
             f"errors='by-brightness' needs the brightness of the stars, and {np.count_nonzero(known)} of {len(table)} "
-            f"positions have a positive flux: give a column flux or mag (--columns mag=...), for at least {FEWEST}"
+            f"positions have a positive flux: give a column flux or mag, by its name in the list if it has another "
+            f"(--columns flux=..., --columns mag=...), for at least {FEWEST}"
         )
     return np.where(known, flux, flux[known].min())
 
