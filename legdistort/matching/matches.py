@@ -46,6 +46,7 @@ BY_EXPOSURE, READ = "by_exposure", "read"
 
 #: Days: exposures whose headers have no more than the date of one night may have two.
 _NIGHT = 1.5
+_SAME_EPOCH = 1e-4  # years: a mean that was written and read
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,6 +351,8 @@ class Matches(ShownAsPrinted):
     def without(self, reasons: Mapping[str, str]) -> Matches:
         """The same matches without some exposures or `nights`, ``{name: reason}``; the exposures join `left_out`.
 
+        The `epoch` is the mean of those that are left if it was that of all.
+
         Raises
         ------
         MatchError
@@ -364,7 +367,10 @@ class Matches(ShownAsPrinted):
         kept = self.keep(rows)
         if len(kept.names) == 1 < len(self.names):
             raise alone(kept.names[0], f"; left out: {reasons_of(reasons)}")
-        return replace(kept, left_out=self.left_out | dict(reasons))
+        mean = _mean_epoch(self.table)
+        own = self.epoch is not None and mean is not None and abs(self.epoch - mean) < _SAME_EPOCH
+        epoch = _mean_epoch(kept.table) if own else self.epoch
+        return replace(kept, left_out=self.left_out | dict(reasons), epoch=epoch)
 
     def _by_exposure(self, names):
         """Fields that have an entry for every exposure, with those of these only."""
@@ -518,9 +524,7 @@ class Matches(ShownAsPrinted):
         poses = estimated(seen) if poses is None else _check_poses(poses, seen.names)
         if seen.fields.any():
             poses = side_by_side(seen, poses, shapes, sky)
-        if epoch is None and "epoch" in table.colnames:
-            epochs = column_contract.values(table, "epoch", u.yr)
-            epoch = float(np.nanmean(epochs)) if np.isfinite(epochs).any() else None
+        epoch = _mean_epoch(table) if epoch is None else epoch
         known = {"observations": seen, "camera": camera, "pose_sigma": pose_sigma, **passed_on}
         return cls(table, shapes, poses, sky, left_out, epoch, header_distortion, **known)
 
@@ -541,6 +545,14 @@ def _plain(value):
     if isinstance(value, (tuple, list)):
         return [_plain(each) for each in value]
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+
+
+def _mean_epoch(table):
+    """Mean Julian year of the positions of a table, None if nothing states any."""
+    if "epoch" not in table.colnames:
+        return None
+    epochs = column_contract.values(table, "epoch", u.yr)
+    return float(np.nanmean(epochs)) if np.isfinite(epochs).any() else None
 
 
 def shapes_by_exposure(shape, names):

@@ -276,7 +276,7 @@ def solve(
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
         diagnostics = _diagnostics(given, fit, prior, scale, pointing=given.pointing, terms=found(scale), **chosen)
         fit = _placed(fit, sought, given, whole) if tie is None else tie(fit, scale=scale)
-    epoch = given.epoch if epoch is None else epoch
+    epoch = fit.matches.epoch if epoch is None else epoch
     sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
     found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue), epoch=epoch)
     solution = _with_camera(_solution(fit, scale, _settings(asked, options, form), found, form), given)

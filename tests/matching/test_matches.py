@@ -251,6 +251,21 @@ def test_an_exposure_of_one_common_star_has_no_pose(sim):
 # --- in and out of files -----------------------------------------------------------------------------------------
 
 
+def test_the_epoch_of_what_is_left_is_its_own(sim):
+    """A mean, unless the caller states another: places would be said to be of a time at which nobody looked."""
+    table = table_of(sim)
+    first = table["exposure"] == sim.matches.names[0]
+    table["epoch"] = np.where(first, 2024.0, 2020.0)
+    shape = sim.matches.shapes[sim.matches.names[0]]
+    left = {sim.matches.names[0]: "another year"}
+    matches = Matches.from_table(table, shape=shape)
+    assert 2020.1 < matches.epoch < 2023.9
+    assert matches.without(left).epoch == pytest.approx(2020)
+    assert Matches.from_table(table, shape=shape, epoch=2022.0).without(left).epoch == 2022
+    solution = solve(matches.without(left))
+    assert solution.stars.meta["epoch"] == pytest.approx(2020)
+
+
 @pytest.mark.parametrize("sky", [True, False])
 def test_meta_survives_ecsv(tmp_path, sky):
     sim = simulate_gsaoi_matches(small=True, seed=1) if sky else simulate_matches(n_stars=8, n_exposures=3, dither=9)
