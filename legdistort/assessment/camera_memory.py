@@ -195,7 +195,7 @@ class CombinedNights(ShownAsPrinted):
     def slopes(self) -> tuple[np.ndarray, np.ndarray]:
         """By the covariate, pixels a unit, normalised Legendre modes (2, n_modes), and their covariance.
 
-        Zero where no dependence is seen. Where nights do not tell, the error is the size `slope` of a coefficient.
+        Zero where no dependence is seen. Where nights do not tell, the error is ten times `slope`.
         """
         k, unit = len(self._rows), self._standard[1]
         mean, covariance = self._chain.at(self._year(None)) if self.slope else (np.zeros(2 * k), np.zeros((2 * k,) * 2))

@@ -18,6 +18,7 @@ _EXACT = 1e-6  # scatter of one night, of which nothing tells [pix]
 _MOST, _FEWEST = 600, 12  # unknowns from which sizes are found, and nights, if there are as many
 _ROUNDS, _SETTLED = 20, 0.02
 _TINY = 1e-3  # of the scatter of nights, which is as good as none
+_WIDE = 10  # sizes of slopes that these may have: one that stands out is not drawn to the others, which are none
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ class Chain:
     rate, walk : float
         Sizes of the rate, pixels a year, and of the walk, pixels in the square root of a year; 0: none.
     slope : float
-        Size of T, pixels; 0: none.
+        Size of T, pixels, which may be 10 times as large; 0: none.
     numbers : ndarray, shape (N,), or None
         x of the nights, if there is a T.
     """
@@ -129,7 +130,7 @@ class Chain:
     @property
     def _precision(self):
         """Of what is sought, S, its rate and T, without any night."""
-        return np.repeat([size**-2.0 for size in (FREE, self.rate, self.slope) if size], self.size)
+        return np.repeat([size**-2.0 for size in (FREE, self.rate, _WIDE * self.slope) if size], self.size)
 
     def _found(self, seen, information, pull):
         covariance = np.linalg.inv(information + np.diag(self._precision))

@@ -97,7 +97,7 @@ def test_a_chain_is_a_dense_least_squares(rate, walk, slope):
             whole[own, own] += 1 / scatter2[i]
         whole[slopes, slopes] += 1 / (rate**2 or 1)
         own = np.arange(size - k, size)
-        whole[own, own] += 1 / (slope**2 or 1e-12)
+        whole[own, own] += 1 / ((10 * slope) ** 2 or 1e-12)
         whole[place[times[0]], place[times[0]]] += 1e-6
         for early, late in pairwise(times):
             step = np.zeros((k, size))

@@ -305,10 +305,14 @@ def test_a_run_takes_it_from_its_frames(tmp_path):
 # --- sets ---------------------------------------------------------------------------------------------------------
 
 
-def linear_nights(seed, n, *, size=0.05, scatter=0.02, within=0.15, exposures=4):
-    """Static distortion, slopes by a unit of the number, numbers, and nights as `fitted` takes them."""
+def linear_nights(seed, n, *, size=0.05, scatter=0.02, within=0.15, exposures=4, alone=False):
+    """Static distortion, slopes by a unit of the number, numbers, and nights as `fitted` takes them.
+
+    With `alone` there is a slope of one mode, and of no other.
+    """
     rng, k = np.random.default_rng(seed), len(DEGREES)
     static, slope = rng.normal(0, 2, k), rng.normal(0, 1, k)
+    slope *= (np.arange(k) == 5) if alone else 1.0
     slope *= size / 2 / np.sqrt(np.sum(slope**2) / 8)  # over numbers from -1 to 1
     nights, numbers = [], rng.uniform(-1, 1, n)
     for i in range(n):
@@ -333,9 +337,10 @@ def linear_nights(seed, n, *, size=0.05, scatter=0.02, within=0.15, exposures=4)
         pytest.param({"n": 12}, 0.9, 1.1, marks=pytest.mark.sets),
         pytest.param({"n": 12, "within": 0.0}, 0.9, 1.1, marks=pytest.mark.sets),
         pytest.param({"n": 6, "within": 1.0}, 0.9, 1.15, marks=pytest.mark.sets),
+        pytest.param({"n": 12, "alone": True}, 0.9, 1.15, marks=pytest.mark.sets),
         pytest.param({"n": 12, "size": 0.0}, 0.9, 1.1, marks=pytest.mark.sets),
     ],
-    ids=["both", "between nights", "within nights", "none"],
+    ids=["both", "between nights", "within nights", "one mode", "none"],
 )
 def test_maps_at_a_value_are_calibrated(words, low, high):
     """Sets of nights as matrices: squared errors over their variance at two values, and what is found."""
