@@ -23,7 +23,7 @@ from .coaddition.options import CoaddOptions
 from .exceptions import AssumptionWarning, InputError, LegdistortError, warn
 from .inputs import exposure_files, table_files
 from .inputs.exposure_names import whole_name
-from .inputs.exposures import observed
+from .inputs.exposures import observed, stated_numbers
 from .inputs.frames.statement import stated_rows
 from .inputs.references.gaia import is_gaia
 from .matching.matcher import match
@@ -246,6 +246,7 @@ def run(
         with timed(timings, "read"):
             exposures, bad = _open_frames(paths, min_exposures, stop_at_bad, progress, reference is not None, **reading)
             solving = _known_of(exposures, solving, prior, reading["camera"])
+            stated_numbers(exposures, matching.keywords)  # refuses what no header states
         with timed(timings, "measure"):
             detections, psfs = _detected(exposures, before, measuring, share)
         with timed(timings, "match"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property, partial
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,8 +33,8 @@ from ..runtime.parallel import map_items
 from ..runtime.trees import codec
 from ..runtime.trees.facts import SIZE, array, number
 from .combined_nights import Chain, contradiction, fitted, own_scatter2
-from .known_maps import DETERMINED, MEAN_SQUARE, chance
-from .night_data import EXACT, Night, check_nights, dates_of, night_of
+from .known_maps import DETERMINED, KEPT, MEAN_SQUARE, chance
+from .night_data import EXACT, Night, check_nights, check_numbers, dates_of, given_by, night_of, standard_numbers
 
 if TYPE_CHECKING:
     from astropy.time import Time
@@ -53,7 +54,8 @@ class CombinedNights(ShownAsPrinted):
     """The static distortion of one detector from many nights, made by `legdistort.combine_nights`.
 
     Night n sees ``S(t_n) + B_n``. S is constant; where the nights show that it changes, it has a rate and a random walk
-    in time. B_n is what the exposures of a night have in common beside it.
+    in time, or depends linearly on a number of the exposures, the covariate. B_n is what the exposures of a night have
+    in common beside it.
 
     Attributes
     ----------
@@ -69,6 +71,12 @@ class CombinedNights(ShownAsPrinted):
         Factors >= 1 on it, as for Student's t distribution: odd nights count less.
     rate, walk : float
         Sizes of the change of a coefficient, pixels a year, and pixels in the square root of a year; 0: none seen.
+    covariate : str or None
+        Name of the number.
+    slope : float
+        Size of the change of a coefficient with it, pixels a unit; 0: none seen.
+    evidence : float
+        By how much a dependence on it makes twice the logarithm of the likelihood larger.
 
     See Also
     --------
@@ -91,6 +99,9 @@ class CombinedNights(ShownAsPrinted):
     oddness: np.ndarray = field(metadata=array("n_nights", minimum=1))
     rate: float = field(default=0.0, metadata=number(minimum=0))
     walk: float = field(default=0.0, metadata=number(minimum=0))
+    covariate: str | None = None
+    slope: float = field(default=0.0, metadata=number(minimum=0))
+    evidence: float = 0.0
 
     @property
     def degree(self) -> int:
@@ -99,6 +110,25 @@ class CombinedNights(ShownAsPrinted):
 
     def _year(self, date):
         return float(self.dates.max() if date is None else epochs.year(date))
+
+    @cached_property
+    def _standard(self):
+        """Mean and unit of the covariate, and what nights have in it, (n_nights,)."""
+        return (0.0, 1.0, None) if self.covariate is None else standard_numbers(self.nights)
+
+    def _number(self, value):
+        """A value of the covariate in its unit from the mean, which is None too."""
+        if value is None:
+            return 0.0
+        if self.covariate is None:
+            raise InputError(
+                f"value {value!r} is that of a covariate, without which these nights were combined: leave it out, or "
+                "name one, combine_nights(..., covariate=) (--covariate)"
+            )
+        if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(value):
+            raise InputError(f"value must be a number, what {self.covariate} is, got {value!r}")
+        mean, unit, _ = self._standard
+        return float((value - mean) / unit)
 
     @cached_property
     def _rows(self):
@@ -111,21 +141,25 @@ class CombinedNights(ShownAsPrinted):
 
     @cached_property
     def _chain(self):
-        given = [(self._rows @ each.around.ravel(), each.information, each.pull) for each in self.nights]
+        _, unit, numbers = self._standard
+        given = given_by(self.nights, self._rows, unit)
         degrees = detector_modes.dynamic_degrees(basis.n_modes(self.degree))
         scatter2 = own_scatter2(self.scatter, self.oddness, self._whole, degrees)
-        return Chain.of(given, scatter2, self.dates, self.rate, self.walk)
+        sizes = {"rate": self.rate, "walk": self.walk, "slope": self.slope * unit}
+        return Chain.of(given, scatter2, self.dates, sizes, numbers)
 
     @property
     def _whole(self):
         """Which are several nights together, and speak of S itself."""
         return np.array([each.n_nights > 1 for each in self.nights])
 
-    def _known(self, date):
-        """S at a date (K,) and its covariance, free along what nights do not tell."""
-        mean, covariance = self._chain.at(self._year(date))
+    def _known(self, date=None, value=None):
+        """S at a date and a value (K,) and its covariance, free along what nights do not tell."""
+        k = len(self._rows)
+        mean, covariance = self._chain.at(self._year(date), self._number(value))
+        mean, covariance = mean[:k], covariance[:k, :k]
         # what a map states counts however wide it is
-        whole = sum(each.information * (1 if each.n_stars else DETERMINED * UNKNOWN**2) for each in self.nights)
+        whole = sum(each.information[:k, :k] * (1 if each.n_stars else DETERMINED * UNKNOWN**2) for each in self.nights)
         power, directions = np.linalg.eigh(whole)
         told, free = directions[:, power > DETERMINED], directions[:, power <= DETERMINED]
         if free.shape[1]:
@@ -136,8 +170,10 @@ class CombinedNights(ShownAsPrinted):
         return mean, covariance
 
     @plain_numbers
-    def static(self, date: float | Time | None = None, *, further_night: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """S at a date, normalised Legendre modes (2, n_modes), and its covariance (2 n_modes, 2 n_modes), pixels.
+    def static(
+        self, date: float | Time | None = None, value: float | None = None, *, further_night: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """S at a date and value, normalised Legendre modes (2, n_modes), and its covariance (2 n_modes,) * 2, pixels.
 
         Combinations that nights together do not determine, to 0.3 px rms per axis over the detector, are zero in it,
         with an error of 1000 px: what little they say of them rests on maps being polynomials exactly.
@@ -146,26 +182,43 @@ class CombinedNights(ShownAsPrinted):
         ----------
         date : float or `~astropy.time.Time`, optional
             Julian year; that of the last night if not given. Without a drift it does not matter.
+        value : float, optional
+            Of the covariate; its mean over all exposures if not given. Without a dependence it does not matter.
         further_night : bool
             Whether the covariance is that of a further night, with the scatter of nights.
         """
-        mean, covariance = self._known(date)
+        mean, covariance = self._known(date, value)
         covariance = covariance + np.diag(self._widths**2) * further_night
         return (self._rows.T @ mean).reshape(2, -1), self._rows.T @ covariance @ self._rows
 
+    @property
+    def slopes(self) -> tuple[np.ndarray, np.ndarray]:
+        """By the covariate, pixels a unit, normalised Legendre modes (2, n_modes), and their covariance.
+
+        Zero where no dependence is seen. Where nights do not tell, the error is ten times `slope`.
+        """
+        k, unit = len(self._rows), self._standard[1]
+        mean, covariance = self._chain.at(self._year(None)) if self.slope else (np.zeros(2 * k), np.zeros((2 * k,) * 2))
+        mean, covariance = mean[k:] / unit, covariance[k:, k:] / unit**2
+        return (self._rows.T @ mean).reshape(2, -1), self._rows.T @ covariance @ self._rows
+
     @plain_numbers
-    def prior(self, date: float | Time | None = None, *, one_exposure: bool = False) -> Prior:
+    def prior(
+        self, date: float | Time | None = None, value: float | None = None, *, one_exposure: bool = False
+    ) -> Prior:
         """What is known of the static distortion of a further night: S at its date, with its error and nights' scatter.
 
         Parameters
         ----------
         date : float or `~astropy.time.Time`, optional
             As for `static`.
+        value : float, optional
+            As for `static`: the mean of the exposures of that night.
         one_exposure : bool
             Whether it is for one exposure alone, which does not tell how far exposures scatter: as far as those of
             the nights, `exposure_scatter`, is the `sigma` of the prior then.
         """
-        static, covariance = self.static(date, further_night=True)
+        static, covariance = self.static(date, value, further_night=True)
         record = {"kind": "nights", "name": self.name, "nights": len(self.nights)}
         known = Prior(static, static_covariance=covariance, shape=self.shape, source=record)
         if not (one_exposure and np.any(self.exposure_scatter)):
@@ -174,37 +227,47 @@ class CombinedNights(ShownAsPrinted):
         return known.with_sigma(self.exposure_scatter[degrees - 1])
 
     @plain_numbers
-    def camera(self, date: float | Time | None = None) -> Camera:
+    def camera(self, date: float | Time | None = None, value: float | None = None) -> Camera:
         """The same as a `Camera` of one detector.
 
         Parameters
         ----------
         date : float or `~astropy.time.Time`, optional
-            As for `static`.
+        value : float, optional
+            As for `prior`.
         """
-        return Camera(self.name, {"1": Detector(self.shape, static=self.prior(date))})
+        return Camera(self.name, {"1": Detector(self.shape, static=self.prior(date, value))})
 
     @plain_numbers
-    def modes(self, date: float | Time | None = None) -> QTable:
+    def modes(self, date: float | Time | None = None, value: float | None = None) -> QTable:
         """One row a mode and axis: ``axis``, ``x_degree``, ``y_degree``, ``coefficient``, ``error``, ``night_scatter``,
-        pixels; shift, rotation and scale are taken off.
+        pixels; shift, rotation and scale are taken off. Where the map depends on a covariate ``slope``, ``slope_error``
+        too, pixels a unit of it.
 
         Parameters
         ----------
         date : float or `~astropy.time.Time`, optional
+        value : float, optional
             As for `static`.
         """  # fmt: skip
-        static, covariance = self.static(date)
+        static, covariance = self.static(date, value)
         error = np.sqrt(np.diag(covariance)).reshape(2, -1)
         scatter = np.sqrt(self._widths**2 @ self._rows**2).reshape(2, -1)
         known = np.where(error < UNKNOWN, error, np.nan)
-        return mode_table(coefficient=static, error=known, night_scatter=scatter)
+        out = mode_table(coefficient=static, error=known, night_scatter=scatter)
+        if self.slope:
+            slopes, covariance = self.slopes
+            more = mode_table(slope=slopes, slope_error=np.sqrt(np.diag(covariance)).reshape(2, -1))
+            for name in ("slope", "slope_error"):
+                out[name] = more[name]
+                out[name].info.format = ".2g"
+        return out
 
     @cached_property
     def table(self) -> QTable:
         """One row a night, worst first: ``night``, ``date`` [yr], ``n_nights``, ``n_exposures``, ``n_stars``,
         ``departure`` [pix] (rms per axis, from what all others say, in the directions that the night determines),
-        ``chi2``, ``dof``, ``p``, ``oddness`` and whether it is ``odd``.
+        ``chi2``, ``dof``, ``p``, ``oddness`` and whether it is ``odd``; ``value``, the mean of a covariate.
         """  # fmt: skip
         rows, count = [], len(self.nights)
         for n, night in enumerate(self.nights):
@@ -214,11 +277,14 @@ class CombinedNights(ShownAsPrinted):
             rms = np.sqrt(np.sum(away**2) / MEAN_SQUARE)
             date = np.nan if night.date is None else night.date
             counts = night.n_nights, night.n_exposures, night.n_stars
-            rows.append((night.name, date, *counts, rms, chi2, dof, p, self.oddness[n]))
+            value = np.nan if night.value is None else night.value
+            rows.append((night.name, date, *counts, rms, chi2, dof, p, self.oddness[n], value))
         rows.sort(key=lambda row: row[8])
         counts = "n_nights", "n_exposures", "n_stars"
-        names = "night", "date", *counts, "departure", "chi2", "dof", "p", "oddness"
+        names = "night", "date", *counts, "departure", "chi2", "dof", "p", "oddness", "value"
         out = QTable(rows=rows, names=names)
+        if self.covariate is None:
+            out.remove_column("value")
         out["date"], out["departure"] = out["date"] * u.yr, out["departure"] * u.pix
         # of two that contradict one another nothing tells which is odd, unless one is of more nights
         others = sum(each.n_nights for each in self.nights) - out["n_nights"]
@@ -234,12 +300,16 @@ class CombinedNights(ShownAsPrinted):
     def seen_by(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """What night number n alone says of the static distortion, and its error: (2, n_modes) each, pixels.
 
-        The error holds the scatter of nights; it is large where the night does not tell.
+        The error holds the scatter of nights; it is large where the night does not tell. Where the map depends on a
+        covariate the night is brought to the mean of that, by the slopes of all nights.
         """
-        chain, scatter2 = self._chain, self._widths**2 * (self.nights[n].n_nights == 1)
-        whole = np.linalg.inv(chain.information[n] + np.eye(len(scatter2)) / UNKNOWN**2)
-        covariance = self._rows.T @ (whole + np.diag(scatter2)) @ self._rows
-        return (self._rows.T @ whole @ chain.pull[n]).reshape(2, -1), np.sqrt(np.diag(covariance)).reshape(2, -1)
+        k, chain, scatter2 = len(self._rows), self._chain, self._widths**2 * (self.nights[n].n_nights == 1)
+        whole = np.linalg.inv(chain.information[n][:k, :k] + np.eye(k) / UNKNOWN**2)
+        mean, covariance = whole @ chain.pull[n][:k], self._rows.T @ (whole + np.diag(scatter2)) @ self._rows
+        if self.slope:
+            slopes = chain.at(self._year(None))[0][k:]
+            mean = mean - whole @ chain.information[n][:k, k:] @ slopes - chain.numbers[n] * slopes
+        return (self._rows.T @ mean).reshape(2, -1), np.sqrt(np.diag(covariance)).reshape(2, -1)
 
     @property
     def dates(self) -> np.ndarray:
@@ -262,29 +332,41 @@ class CombinedNights(ShownAsPrinted):
         return self.rate > 0 or self.walk > 0
 
     @plain_numbers
-    def to_dict(self, date: float | Time | None = None) -> dict[str, Any]:
+    def to_dict(self, date: float | Time | None = None, value: float | None = None) -> dict[str, Any]:
         """Everything but what nights say one by one as numbers and texts for JSON.
 
         Parameters
         ----------
         date : float or `~astropy.time.Time`, optional
+        value : float, optional
             As for `static`.
         """
         sizes = {"scatter_px": self.scatter.tolist(), "exposure_scatter_px": self.exposure_scatter.tolist()}
         sizes |= {"rate_px_yr": self.rate, "walk_px_root_yr": self.walk}
         named = {"name": self.name, "degree": self.degree, "date": self._year(date) or None, "odd": list(self.odd)}
-        return named | sizes | {"modes": records(self.modes(date)), "nights": records(self.table)}
+        if self.covariate is not None:
+            mean, unit, _ = self._standard
+            rms, error = self._slope_rms if self.slope else (0.0, None)
+            depends = {"covariate": self.covariate, "evidence": self.evidence, "slope_px": rms, "slope_error_px": error}
+            sizes |= depends | {
+                "mean": float(mean),
+                "rms": float(unit),
+                "value": float(mean if value is None else value),
+            }
+        return named | sizes | {"modes": records(self.modes(date, value)), "nights": records(self.table)}
 
     def plot(self, *, fig: Figure | None = None) -> Figure:
         """Coefficients against time, see `legdistort.plots.memory_plots.plot_memory`."""
         return plot_memory(self, fig=fig)
 
     @plain_numbers
-    def write(self, path: StrPath, *, date: float | Time | None = None, overwrite: bool = False) -> Path:
+    def write(
+        self, path: StrPath, *, date: float | Time | None = None, value: float | None = None, overwrite: bool = False
+    ) -> Path:
         """Write a camera file (`Camera.read`, ``--prior``, ``--camera``), with the nights; returns the path."""
         own = {"layout": LAYOUT, "provenance": provenance.stamp()} | codec.to_tree(self)
         with replacing(path, overwrite=overwrite) as file:
-            whole = camera_files.tree_of(self.camera(date)) | {ROOT: own}
+            whole = camera_files.tree_of(self.camera(date, value)) | {ROOT: own}
             asdf.AsdfFile(whole, version=asdf_files.ASDF_STANDARD).write_to(file)
         return Path(path)
 
@@ -319,7 +401,7 @@ class CombinedNights(ShownAsPrinted):
 
     def _said_of_weak(self):
         """Combinations whose errors are far larger than those of most, which single coefficients do not show."""
-        error = np.sqrt(np.linalg.eigvalsh(self._known(None)[1]))
+        error = np.sqrt(np.linalg.eigvalsh(self._known()[1]))
         weak = error > _WEAK * np.median(error)
         if not weak.any():
             return []
@@ -328,6 +410,27 @@ class CombinedNights(ShownAsPrinted):
         return [
             f"{np.count_nonzero(weak)} combinations {known} in the errors of all of their coefficients; the "
             f"{np.count_nonzero(~weak)} others are known to {rest:.2g} px rms."
+        ]
+
+    @property
+    def _slope_rms(self):
+        """Slope in all, px a unit of the covariate, rms per axis over the detector, and its error."""
+        slopes, covariance = (each / factor for each, factor in zip(self.slopes, (1, MEAN_SQUARE), strict=True))
+        size = np.linalg.norm(slopes)
+        return float(size / np.sqrt(MEAN_SQUARE)), float(np.sqrt(slopes.ravel() @ covariance @ slopes.ravel()) / size)
+
+    def _said_of_covariate(self):
+        """Whether the map depends on it."""
+        if self.covariate is None:
+            return []
+        told = f"twice ln L is larger by {self.evidence:.1f}"
+        if not self.slope:
+            return [f"No dependence on {self.covariate} is seen ({told} with one, {KEPT:g} are needed)."]
+        mean, (rms, error) = self._standard[0], self._slope_rms
+        low, high = min(each.lowest for each in self.nights), max(each.highest for each in self.nights)
+        return [
+            f"It depends on {self.covariate}, by {rms:.3g} +- {error:.1g} px rms a unit ({told}): by "
+            f"{rms * (high - low):.2g} px from {low:g} to {high:g}. Coefficients are those at {mean:.6g}."
         ]
 
     def __str__(self) -> str:
@@ -342,6 +445,7 @@ class CombinedNights(ShownAsPrinted):
             drift = f"{self.rate:.2g} px a year, and wanders by {self.walk:.2g} px in the root of a year"
             if self.drifts or len(self.nights) > 2:
                 lines.append(f"A coefficient changes by {drift}." if self.drifts else "No change with time is seen.")
+        lines += self._said_of_covariate()
         if np.any(own := self.exposure_scatter):
             scatter = ", ".join(f"{each:.2g} (degree {d})" for d, each in enumerate(own, 1))
             lines.append(f"Exposures scatter about their night by {scatter} px a coefficient.")
@@ -359,6 +463,7 @@ def combine_nights(
     results: Sequence[Solution | CombinedNights | Prior | StrPath],
     *,
     name: str | None = None,
+    covariate: str | None = None,
     workers: int | None = None,
     progress: bool = False,
 ) -> CombinedNights:
@@ -375,6 +480,10 @@ def combine_nights(
         Solutions of nights or fields, folders with one, maps, and earlier combinations, to which the others are added.
     name : str, optional
         Of the camera; by default the instrument of an earlier combination, else "camera".
+    covariate : str, optional
+        A number of every exposure on which the static distortion may depend linearly, by a slope of every mode: a
+        column of the tables of matches, such as ``match(keywords=...)`` takes from headers. It is kept by the same
+        evidence as a drift. By default that of an earlier combination. An angle must not wrap.
     workers : int, optional
         Processes that solve nights.
     progress : bool
@@ -388,12 +497,12 @@ def combine_nights(
     ------
     InputError
         Naming the night: of another detector or degree, of a camera of several detectors, with exposures that were
-        given before.
+        given before, or without the covariate. If that is one number everywhere.
 
     Warns
     -----
     AssumptionWarning
-        For maps without a width that do not scatter at a degree.
+        For maps without a width that do not scatter at a degree; for a covariate that may be an angle that wraps.
 
     See Also
     --------
@@ -419,15 +528,31 @@ def combine_nights(
         (earlier if isinstance(thing, CombinedNights) else solved).append((label, thing))
     nights = [night for _, each in earlier for night in each.nights]
     shapes = {each.shape for _, each in earlier}
-    made = list(map_items(night_of, solved, workers=workers, progress=progress, description="nights", unit="night"))
+    covariate = _common_covariate(earlier, covariate)
+    reduce, shown = partial(night_of, covariate=covariate), {"description": "nights", "unit": "night"}
+    made = list(map_items(reduce, solved, workers=workers, progress=progress, **shown))
     nights += [night for night, _ in made]
     check_nights(nights, shapes | {shape for _, shape in made})
     name = name or (earlier[0][1].name if earlier else "camera")
     shape = next(iter(shapes | {shape for _, shape in made}))
-    found = _combined(nights, shape, name)
+    if covariate is not None:
+        check_numbers(nights, covariate)
+    found = _combined(nights, shape, name, covariate)
     if not earlier and len(solved) > 1:
         _warn_of_one_map([thing for _, thing in solved], found.scatter)
     return found
+
+
+def _common_covariate(earlier, covariate):
+    """That which is asked for, or else that of earlier combinations, which must have the same."""
+    if covariate is not None and not (isinstance(covariate, str) and covariate):
+        raise InputError(f"covariate must be the name of a column or keyword, got {covariate!r}")
+    asked = covariate or next((each.covariate for _, each in earlier if each.covariate), None)
+    for label, each in earlier:
+        if each.covariate != asked:
+            has = f"covariate {each.covariate}" if each.covariate else "no covariate"
+            raise InputError(f"{label} was combined with {has}, not {asked}: give the solutions of its nights instead")
+    return asked
 
 
 def _warn_of_one_map(things, scatter):
@@ -455,20 +580,22 @@ def _opened(thing):
     return Path(thing) if entry is None else kinds[entry].read(thing)
 
 
-def _combined(nights, shape, name):
+def _combined(nights, shape, name, covariate):
     nights = sorted(nights, key=lambda night: np.inf if night.date is None else night.date)
     n = nights[0].around.shape[1]
     rows, degrees = detector_modes.dynamic_basis(shape, n), detector_modes.dynamic_degrees(n)
-    given = [(rows @ each.around.ravel(), each.information, each.pull) for each in nights]
+    _, unit, numbers = standard_numbers(nights) if covariate else (0.0, 1.0, None)
     whole = [each for each in nights if each.n_nights > 1]
     known = None
     if whole:  # squares weighted by the number of nights that they are of
         weight = [each.n_nights for each in whole]
         known = np.sqrt(np.average([each.nightly**2 for each in whole], axis=0, weights=weight))
     together = np.array([each.n_nights > 1 for each in nights])
-    chain, oddness, scatter = fitted(given, dates_of(nights), degrees, together, known)
-    drift = {"rate": chain.rate, "walk": chain.walk}
-    return CombinedNights(tuple(nights), shape=shape, name=name, scatter=scatter, oddness=oddness, **drift)
+    given = given_by(nights, rows, unit)
+    chain, oddness, scatter, evidence = fitted(given, dates_of(nights), degrees, together, known, numbers)
+    changes = {"rate": chain.rate, "walk": chain.walk, "slope": float(chain.slope / unit)}
+    changes |= {"covariate": covariate, "evidence": evidence}
+    return CombinedNights(tuple(nights), shape=shape, name=name, scatter=scatter, oddness=oddness, **changes)
 
 
 def _from_tree(kind, tree):

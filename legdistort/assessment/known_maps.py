@@ -29,6 +29,8 @@ from ..solving.options import SolveOptions
 MEAN_SQUARE = 8
 #: Information [pix^-2] from which a direction is determined: its error is 0.3 px at most, rms per axis over a detector.
 DETERMINED = 1 / (MEAN_SQUARE * 0.3**2)
+#: What depends on time, or on a number, is kept if it makes twice the logarithm of the likelihood larger by so much.
+KEPT = 6.0
 _ROUNDS = 3
 _KEPT = "loss", "motion", "motion_sigma", "motion_epoch", "night_sigma"  # settings of a night
 _MOST = 500  # coefficients from which the scatter of exposures is found
@@ -214,14 +216,15 @@ class Shown:
     """What exposures of one detector show of its static distortion, from all but what was known of it.
 
     ``-2 ln L = z' information z - 2 pull' z`` for a step z of the coefficients, in the order of
-    `legdistort.geometry.detector_modes.dynamic_basis`, from a map.
+    `legdistort.geometry.detector_modes.dynamic_basis`, from a map; where exposures have a number, z goes on with K
+    slopes by it, and the map is that of the mean number.
 
     Attributes
     ----------
     around : ndarray, shape (2, n_modes)
         That map: what they show where they determine it, the rest as it was.
-    information : ndarray, shape (K, K)
-    pull : ndarray, shape (K,)
+    information : ndarray, shape (K, K) or (2 K, 2 K)
+    pull : ndarray, shape (K,) or (2 K,)
     scatter : ndarray, shape (degree,)
         Of exposures about it, or about their night, by degree, pixels.
     nightly : ndarray, shape (degree,), or None
@@ -242,12 +245,13 @@ class Shown:
     shape: tuple
 
 
-def shown_by(solution, label, other=None):
+def shown_by(solution, label, other=None, numbers=None):
     """What the exposures of a solution show of the static distortion of their detector (`Shown`).
 
     It is solved again around what it shows and, where it shows nothing, around the `other` map (2, n_modes) or None, so
     that a common map of the plane is small, and what is linear in it exact. Exposures and nights scatter about it by
-    what they show (`legdistort.solving.knowledge.exposures.ExposureModel`).
+    what they show (`legdistort.solving.knowledge.exposures.ExposureModel`), and depend linearly on `numbers`, a dict by
+    exposure, if these are given and the evidence is for it; what they show of the slopes is not left out then either.
     """
     shapes = set(solution.estimate.shapes.values())
     if len(shapes) > 1:
@@ -266,15 +270,18 @@ def shown_by(solution, label, other=None):
     for _ in range(_ROUNDS):
         options = SolveOptions(degree=degree, prior=Prior(around, shape=shape), clip=None, **kept)
         fit = single_fit.estimate(matches, options, near=fit)
-        information, pull, sizes_found, dof = _shown(fit)
-        sizes, vectors = np.linalg.eigh(information)
+        number = None if numbers is None else np.array([numbers[name] for name in fit.problem.names])
+        information, pull, sizes_found, dof = _shown(fit, number)
+        k = len(rows)
+        sizes, vectors = np.linalg.eigh(information[:k, :k])
         found = np.where(sizes > DETERMINED, 1 / np.maximum(sizes, DETERMINED), 0)  # others stay where they are
-        step = vectors * found @ vectors.T @ pull
+        step = vectors * found @ vectors.T @ pull[:k]
         around = around + (rows.T @ step).reshape(2, n)
     nightly = None if fit.problem.n_nights == 0 else sizes_found[degree:]
     if nightly is not None and fit.problem.night_sigma is not None:
         nightly = np.full(degree, float(fit.problem.night_sigma))
-    return Shown(around, information, pull - information @ step, sizes_found[:degree], nightly, dof, degree, shape)
+    pull = pull - information[:, :k] @ step
+    return Shown(around, information, pull, sizes_found[:degree], nightly, dof, degree, shape)
 
 
 def sound(solution):
@@ -297,37 +304,59 @@ def _at_errors_in_force(solution):
     return Matches.from_table(table, shape=next(iter(solution.estimate.shapes.values())), poses=solution.poses)
 
 
-def _shown(fit):
+def _shown(fit, number=None):
     """What exposures say of their static distortion from the prior: information (K, K), pull (K,), sizes, dof.
 
-    Sizes are found with nothing known of it, from exposures drawn at random where these are many. The degrees of
+    With a number (n_exposures,) also of its slopes: (2 K, 2 K) and (2 K,). Sizes are found with nothing known of it,
+    from exposures drawn at random where these are many; with slopes if the evidence is for these. The degrees of
     freedom are those by which they tell the determinant of the information, in the directions that count.
     """
+    varies = number is not None and np.ptp(number) > 0
+    unit = np.std(number) if varies else 1.0
+    away = (number - np.mean(number)) / unit if varies else None
     problem, state = fit.weighted, absorb_similarities(fit.weighted, fit.result.state)
 
     def known(most):
         keep = drawn(problem.detectors, most // (2 * problem.n_modes))
         part = part_of(problem, state, keep)
         model = ExposureModel.of(*part, fit.result.gauge.all_motion[keep], np.zeros(len(keep), dtype=int))
-        free = model.statics(width=FREE)
-        return model, free, Factor.joined([model.departures, free])
+        return replace(model, number=away[keep]) if varies else model
 
-    model, _, factor = known(_MOST)
-    unit = 1 / np.sqrt(np.median(np.diag(model.data.curvature)))
-    found = most_likely(model.data, factor, np.full(model.n_scatters, 10 * unit), unit * np.array(RANGE))
-    model, free, factor = known(DIRECT_LIMIT)
-    whole = Posterior(model.data, factor, found.sizes)
+    model = known(_MOST)
+    found, n_sizes = _sizes_of(model), model.n_scatters
+    model = known(DIRECT_LIMIT)
+    k, free = len(model.degrees), Factor.joined([model.statics(width=FREE), model.slopes(width=FREE)])
+    whole = Posterior(model.data, Factor.joined([model.departures, free]), found.sizes[:n_sizes])
     information, pull = whole.without(free)
-    sizes, vectors = np.linalg.eigh(information)
+    sizes, vectors = np.linalg.eigh(information[:k, :k])
     directions = vectors[:, sizes > DETERMINED].T
 
     def certain(posterior):
-        return np.linalg.slogdet(directions @ posterior.without(free)[0] @ directions.T)[1] / max(len(directions), 1)
+        information = posterior.without(free)[0][:k, :k]
+        return np.linalg.slogdet(directions @ information @ directions.T)[1] / max(len(directions), 1)
 
-    larger = found.sizes * (1 + (_LARGER - 1) * np.eye(len(found.sizes)))
+    larger = whole.sizes * (1 + (_LARGER - 1) * np.eye(n_sizes))
     share = certain(whole) - np.array([certain(replace(whole, sizes=each)) for each in larger])
     share /= 2 * np.log(_LARGER)
-    return information, pull, found.sizes, float(1 / np.sum(share**2 / np.maximum(_freedom(found), 1) + 1e-12))
+    dof = float(1 / np.sum(share**2 / np.maximum(_freedom(found)[:n_sizes], 1) + 1e-12))
+    if number is not None:
+        information, pull = np.pad(information, (0, 2 * k - len(pull))), np.pad(pull, (0, 2 * k - len(pull)))
+        per = np.repeat([1.0, unit], k)
+        information, pull = per[:, None] * information * per, per * pull
+    return information, pull, whole.sizes, dof
+
+
+def _sizes_of(model):
+    """The posterior at the scatters that are most likely, with slopes of a size that is found if evidence is for it."""
+    unit, found = 1 / np.sqrt(np.median(np.diag(model.data.curvature))), None
+    for each in (replace(model, number=None), model)[: 1 + (model.n_slopes > 0)]:
+        sloped = each.slopes(size=each.n_scatters)
+        factor = Factor.joined([each.departures, each.statics(width=FREE), sloped])
+        start = np.full(each.n_scatters + (each.n_slopes > 0), 10 * unit)
+        likely = most_likely(each.data, factor, start, unit * np.array(RANGE))
+        if found is None or found.cost - likely.cost > KEPT:
+            found = likely
+    return found
 
 
 def _freedom(posterior):

@@ -27,6 +27,7 @@ from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from .camera_memory import CombinedNights
 from .known_maps import DETERMINED, MEAN_SQUARE, chance, known_map, pointed
+from .night_data import numbers_in
 from .star_difference import StarDifference, compare_stars, shared_exposures
 
 if TYPE_CHECKING:
@@ -284,6 +285,7 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
 
 def _of_maps(one, two):
     """The `MapDifference` of what was opened, as of independent data."""
+    one, two = _at_number(one, two), _at_number(two, one)
     alone = not isinstance(two[0], Solution) or (isinstance(one[0], Camera) and two[0].camera.has_focal_plane)
     one = known_map(*one, known_map(*two) if alone else None)
     two = known_map(*two, one)
@@ -322,6 +324,16 @@ def _of_maps(one, two):
         int(np.count_nonzero(~determined)), _named(inside, [pair[0] for pair in pairs], n),
         left_out=tuple(dict.fromkeys(left_out)),
     )  # fmt: skip
+
+
+def _at_number(labelled, other):
+    """Nights whose map depends on a number as that map, where the other is a solution that states the number."""
+    nights, label = labelled
+    if not (isinstance(nights, CombinedNights) and nights.slope and isinstance(other[0], Solution)):
+        return labelled
+    label = nights.name if label.startswith("the ") else label
+    numbers = numbers_in(other[0], nights.covariate, other[1])
+    return nights.prior(value=np.mean(list(numbers.values()))), label
 
 
 def _named(inside, detectors, n):

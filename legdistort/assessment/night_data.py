@@ -8,7 +8,7 @@ import numpy as np
 from astropy import units as u
 
 from ..cameras.stated_errors import StaticErrors
-from ..exceptions import InputError
+from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry import basis, detector_modes
 from ..inputs import column_contract
 from ..inputs.repetitions import fingerprints
@@ -19,6 +19,7 @@ from .known_maps import pointed, shown_by, sound
 
 #: Error of a coefficient [pix] of a map that states none: that of a header as `legdistort attach` writes it.
 EXACT = 1e-3
+_TURN, _HALF = 360, 180  # degrees
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +28,8 @@ class Night:
 
     ``-2 ln L = z' information z - 2 pull' z`` for a step z from the map `around`, in the order of
     `legdistort.geometry.detector_modes.dynamic_basis`: stars, departures of exposures and a common map of the plane are
-    eliminated, and what was known beforehand is left out.
+    eliminated, and what was known beforehand is left out. Of nights whose exposures have a number z goes on with the
+    slopes by it, pixels a unit, and the map is that of the mean number.
 
     Attributes
     ----------
@@ -37,9 +39,9 @@ class Night:
     n_exposures, n_stars : int
     around : ndarray, shape (2, n_modes)
         Pixels.
-    information : ndarray, shape (k, k)
-        Pixels^-2.
-    pull : ndarray, shape (k,)
+    information : ndarray, shape (k, k) or (2 k, 2 k)
+        Pixels^-2, with slopes beyond the first k.
+    pull : ndarray, shape (k,) or (2 k,)
         Pixels^-1.
     n_nights : int
         That it is made of: more than one if they were solved together.
@@ -53,6 +55,12 @@ class Night:
         Of several nights that were solved together those that depart farther than the others, and were left out.
     exposures : tuple of str
         Fingerprints of what was measured in those that count, so that nothing counts twice.
+    value : float or None
+        Mean over its exposures of that on which the static distortion may depend.
+    spread : float
+        Their rms deviation from it.
+    lowest, highest : float or None
+        Of these.
     """
 
     name: str
@@ -69,11 +77,16 @@ class Night:
     dof: float = field(metadata=number(minimum=0, infinite=True))
     odd: tuple[str, ...] = ()
     exposures: tuple[str, ...] = ()
+    value: float | None = None
+    spread: float = field(default=0.0, metadata=number(minimum=0))
+    lowest: float | None = None
+    highest: float | None = None
 
     @classmethod
-    def of(cls, solution: Solution, name: str, around: np.ndarray | None = None) -> Night:
-        """That of a solution, linearised round a map (2, n_modes) where the night itself shows none."""
-        shown = shown_by(solution, name, around)
+    def of(cls, solution: Solution, name: str, covariate: str | None = None) -> Night:
+        """That of a solution, with slopes by a column of the table of matches, if one is named."""
+        numbers = None if covariate is None else numbers_in(solution, covariate, name)
+        shown = shown_by(solution, name, numbers=numbers)
         given = {each: getattr(shown, each) for each in ("around", "information", "pull", "scatter", "nightly", "dof")}
         table, nights = solution.residuals[sound(solution)], solution.nights
         counts = {f"n_{each}s": len(np.unique(table[each])) for each in ("exposure", "star")}
@@ -82,6 +95,10 @@ class Night:
         odd = tuple(str(each) for each in nights["name"][nights["odd"]])
         measured, used = fingerprints(solution.residuals), set(table["exposure"])
         marks = tuple(mark for each in solution.names if each in used for mark in measured[each])
+        if numbers is not None:
+            values = np.array(list(numbers.values()))
+            given |= {"value": float(values.mean()), "spread": float(values.std())}
+            given |= {"lowest": float(values.min()), "highest": float(values.max())}
         return cls(name, date=date, odd=odd, exposures=marks, **counts, **given)
 
     @classmethod
@@ -106,16 +123,43 @@ class Night:
         )  # fmt: skip
 
 
-def night_of(item):
+def numbers_in(solution, covariate, name):
+    """What a column states of every exposure of a solution that counts, ``{exposure: number}``."""
+    table = solution.residuals[sound(solution)]
+    if covariate not in table.colnames:
+        own = {*column_contract.MATCHED, *column_contract.DETECTED, "used", "dx", "dy"}
+        others = [each for each in table.colnames if each not in own]
+        raise InputError(
+            f"{name} has no number {covariate} of its exposures: take it from the headers of the frames, "
+            f"match(keywords=['{covariate}']) (--keywords {covariate} of match or run), or give it as a column of the "
+            f"star lists, and solve again, or leave that night out; further columns are {some_of(others, 6) or 'none'}"
+        )
+    try:
+        values = column_contract.values(table, covariate)
+    except InputError as error:
+        raise InputError(f"{name}: {error}; a covariate is a number") from None
+    names, first, owner = np.unique(np.asarray(table["exposure"]), return_index=True, return_inverse=True)
+    for fault, words in (
+        (~np.isfinite(values), "is not known of exposure {}: give it, or leave that exposure out (--without)"),
+        (values != values[first][owner], "is not one number in exposure {}: a covariate is one of every exposure"),
+    ):
+        if fault.any():
+            raise InputError(f"{name}: {covariate} {words.format(names[owner[np.argmax(fault)]])}")
+    return {str(each): float(value) for each, value in zip(names, values[first], strict=True)}
+
+
+def night_of(item, covariate=None):
     """The night of a labelled solution, map or path, and the shape of its detector."""
     label, thing = item
     if isinstance(thing, Prior):
+        if covariate is not None:
+            raise InputError(f"{label} is a map, which states no {covariate}: leave it out, or the covariate")
         return Night.of_map(thing, label), thing.shape
     solution = thing if isinstance(thing, Solution) else Solution.read(thing)
     if solution.camera.has_focal_plane:
         raise InputError(f"{label} is of camera {solution.camera.name} with several detectors: solve them one by one")
     shapes = set(solution.estimate.shapes.values())
-    return Night.of(solution, label), next(iter(shapes))
+    return Night.of(solution, label, covariate), next(iter(shapes))
 
 
 def check_nights(nights, shapes):
@@ -136,6 +180,42 @@ def check_nights(nights, shapes):
                     f"{night.name} has an exposure that {seen[position]} has too: give every exposure once"
                 )
         seen |= dict.fromkeys(night.exposures, night.name)
+
+
+def check_numbers(nights, covariate):
+    """The numbers of nights differ, and do not look like an angle that wraps, which gives a warning."""
+    low, high = min(each.lowest for each in nights), max(each.highest for each in nights)
+    if low == high:
+        raise InputError(
+            f"{covariate} is {low:g} in all exposures, so that nothing can depend on it: leave the covariate out, or "
+            "give nights with other values"
+        )
+    if _HALF < high - low <= _TURN and max(-low, high) <= _TURN:
+        warn(
+            f"{covariate} runs from {low:g} to {high:g}: if it is an angle that wraps at {_TURN} degrees, its ends "
+            "are neighbours, and no linear dependence on it is right; give the angle as it is driven, without jumps, "
+            "or its sine or cosine, as a column of the star lists",
+            AssumptionWarning,
+        )
+
+
+def standard_numbers(nights):
+    """Mean and rms over all exposures of the numbers of nights, and the nights' own in these units, (N,)."""
+    number, spread = (np.array([getattr(each, name) for each in nights]) for name in ("value", "spread"))
+    weight = [each.n_exposures for each in nights]
+    mean = np.average(number, weights=weight)
+    unit = np.sqrt(np.average(spread**2 + (number - mean) ** 2, weights=weight))
+    return mean, unit, (number - mean) / unit
+
+
+def given_by(nights, rows, unit):
+    """What nights see, as `legdistort.assessment.combined_nights.fitted` takes it, with slopes by a unit."""
+    out = []
+    for each in nights:
+        around, k = rows @ each.around.ravel(), len(rows)
+        scale = np.repeat([1.0, 1 / unit], k)[: len(each.pull)]
+        out.append((around, scale[:, None] * each.information * scale, scale * each.pull))
+    return out
 
 
 def dates_of(nights):

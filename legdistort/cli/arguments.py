@@ -16,6 +16,11 @@ def names(text):
     return [name.lstrip("-").replace("_", "-") for name in text.split(",") if name]
 
 
+def keywords(text):
+    """``NAME,...`` as a list, as they stand."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
 def columns(text):
     """``ours=theirs,...`` as pairs."""
     pairs = [item.split("=") for item in text.split(",") if item]

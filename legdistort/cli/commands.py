@@ -370,10 +370,12 @@ def do_nights(a):
     words = given(a, options.NIGHTS) | {"results": [each.rstrip("/") or each for each in a.results]}
     words["progress"] = wants_progress(a)
     found = legdistort.combine_nights(**words, workers=a.workers or min(parallel.n_cores(), len(a.results)))
-    found.write(a.out, date=a.date, overwrite=a.overwrite)
+    found.write(a.out, date=a.date, value=a.value, overwrite=a.overwrite)
     _draw(found, a)
-    at = "" if a.date is None else f"\n\nThe camera in {a.out} is that of {a.date:g}."
-    _say(a, f"{found}{at}", found.to_dict(a.date))
+    asked = {"date": a.date, found.covariate: a.value}
+    at = ", ".join(f"{name} {number:g}" for name, number in asked.items() if number is not None)
+    at = f"\n\nThe camera in {a.out} is that of {at}." if at else ""
+    _say(a, f"{found}{at}", found.to_dict(a.date, a.value))
     return 3 if a.strict and found.odd else 0
 
 

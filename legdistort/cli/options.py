@@ -8,6 +8,7 @@ from .arguments import (
     Option,
     columns,
     extension,
+    keywords,
     length,
     names,
     number_or_name,
@@ -143,18 +144,16 @@ NIGHTS = {
         path="inputs",
     ),
     "name": Option("of the camera", metavar="NAME"),
+    "covariate": Option("number of exposures, a column, on which the distortion may depend", metavar="NAME"),
 }
 AT_DATE = {
-    "date": Option(
-        "at which the camera is to be, a decimal year (default: of the last night)", type=float, metavar="YEAR"
-    )
+    "date": Option("of the camera, a decimal year (default: of the last night)", type=float, metavar="YEAR"),
+    "value": Option("of the covariate, for the camera (default: mean of the exposures)", type=float, metavar="NUMBER"),
 }
 REPLACING = {"overwrite": Option("replace a picture that exists", action="store_true")}
 
 KNOWN_STATIC = {
-    "prior": Option(
-        "known static distortion: see the command prior; of run also header: that of the frames", path="read"
-    ),
+    "prior": Option("known static distortion, see the command prior; header: of the frames of run", path="read"),
     "static_sigma": Option(
         "uncertainty of a coefficient of it; without --prior its size, nothing else being known",
         type=float,
@@ -248,6 +247,7 @@ MATCHING = Group(
         "start": Option(
             "where stars lie: exposure, xshift, yshift [pixels], rotation [degrees]", metavar="TABLE", path="read"
         ),
+        "keywords": Option("numbers in headers of frames that become columns", type=keywords, metavar="NAME,..."),
     },
 )
 

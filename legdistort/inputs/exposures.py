@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ from ..exceptions import DamagedError, InputError, some_of
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from .exposure_names import check_exposure_name, whole_name
+from .frames.cards import as_number
 from .frames.undefined_pixels import undefined_pixels
 
 if TYPE_CHECKING:
@@ -193,6 +195,33 @@ def observed(exposures):
         same = min(times) == max(times)
         found["exposure time"] = f"{len(times)} x {times[0]:g} s" if same else f"{sum(times):g} s in all"
     return {what: text for what, text in found.items() if text}
+
+
+def stated_numbers(exposures, keywords):
+    """What headers state under keywords, ``{keyword: {exposure: number}}``; NaN where one does not, as the log says.
+
+    Parameters
+    ----------
+    exposures : iterable of Exposure or ExposureFile
+    keywords : sequence of str or None
+
+    Raises
+    ------
+    InputError
+        For a keyword that none of them states as a number, with those like it.
+    """
+    headers, out = {whole_name(exposure): exposure.header for exposure in exposures}, {}
+    for keyword in keywords or ():
+        stated = {name: as_number(header.get(keyword)) for name, header in headers.items()}
+        lacking = [name for name, value in stated.items() if value is None]
+        if len(lacking) == len(stated):
+            near = get_close_matches(keyword.upper(), list(headers[lacking[0]]), cutoff=0.5)
+            like = f"; {lacking[0]} has {', '.join(near)}" * bool(near)
+            raise InputError(f"no header states {keyword} as a number: correct keywords= (--keywords){like}")
+        if lacking:
+            log.warning("%s is no number in the headers of %s", keyword, some_of(lacking, 6))
+        out[keyword] = {name: np.nan if value is None else value for name, value in stated.items()}
+    return out
 
 
 def _is_closed(value):

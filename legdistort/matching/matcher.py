@@ -22,7 +22,7 @@ from ..inputs import column_contract, repetitions
 from ..inputs.column_contract import colour_column
 from ..inputs.exposure_files import ExposureFile, listed
 from ..inputs.exposure_names import whole_name
-from ..inputs.exposures import Exposure
+from ..inputs.exposures import Exposure, stated_numbers
 from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE, Flag
@@ -73,6 +73,7 @@ def match(
     reject_flags: int = UNUSABLE,
     isolation: float | None = LIMIT,
     start: Mapping[str, Sequence[float]] | Table | StrPath | None = None,
+    keywords: Sequence[str] | None = None,
     progress: bool = False,
 ) -> Matches:
     """Find out which detections are the same star.
@@ -115,6 +116,9 @@ def match(
         degrees about the centre of the detector from x to y; columns ``exposure``, ``xshift``, ``yshift``,
         ``rotation``. It is tried first, as header WCSs are, in place of these. Of the holes of a mask, which match as
         well when they are shifted by a period, it selects the period, if it is right to half of one.
+    keywords : sequence of str, optional
+        Keywords of numbers in the headers of `exposures`, such as the angle of a rotator: each becomes a column of that
+        name, if there is none yet, NaN where a header does not state it (see `legdistort.combine_nights`).
     progress : bool
         Show progress bars.
 
@@ -128,8 +132,8 @@ def match(
     Raises
     ------
     InputError
-        For missing columns, bad values, a missing shape, fewer exposures than `min_exposures`, or detectors that
-        seem to lie in each other's places.
+        For missing columns, bad values, a missing shape, fewer exposures than `min_exposures`, keywords that no header
+        states, or detectors that seem to lie in each other's places.
     MatchError
         For exposures in groups without a star in common, no star in `min_exposures` exposures, or holes of a mask of
         which nothing tells by how many periods they are shifted.
@@ -149,12 +153,11 @@ def match(
     """
     options = MatchOptions(
         min_exposures=min_exposures, columns=columns, tolerance=tolerance, reject_flags=reject_flags,
-        isolation=isolation, start=start, progress=progress,
+        isolation=isolation, start=start, keywords=keywords, progress=progress,
     )  # fmt: skip
     _check_measured(detections)
     check_camera(camera)
-    if columns:
-        detections = column_contract.rename(detections, columns)
+    detections = column_contract.rename(detections, columns) if columns else detections
     table = column_contract.check(detections, column_contract.DETECTED, "the table of detections")
     table["exposure"] = table["exposure"].astype(str)
     exposures = None if exposures is None else listed(exposures, "match")
@@ -167,7 +170,7 @@ def match(
                 )
             shapes = detector_layout.shapes_of(table, exposures, shape)
             log.info("neither a camera nor headers: how the detectors lie is sought in the dithers")
-            _add_epochs(table, {whole_name(exposure): exposure for exposure in exposures or ()})
+            _add_stated(table, {whole_name(exposure): exposure for exposure in exposures or ()}, options.keywords)
             again = vars(replace(options, columns=None))
             return detector_layout.match_parts(table, shapes, lambda parts, shape: match(parts, shape=shape, **again))
         if any(exposure.detector is not None for exposure in exposures or ()):
@@ -180,6 +183,7 @@ def match(
         shape = camera.field
         exposures = None if exposures is None else focal_planes(camera, exposures)
     named = None if exposures is None else {e.name: e for e in exposures}
+    _add_numbers(table, named or {}, options.keywords)
     names = list(dict.fromkeys(table["exposure"].tolist()) if named is None else named)
     _check_names(table, names, min_exposures)
     shapes = _shapes(table, names, named, shape)
@@ -203,7 +207,7 @@ def match(
     tying = None if camera is None or len(names) == 1 else _ties_of_few(camera, table, star, min_exposures)
     table, star = _keep_common(table, star, 1 if len(names) == 1 else min_exposures, left_out, tying, tell=True)
     epoch = mean_epoch(e.header for e in named.values()) if named else None
-    _add_epochs(table, named or {})
+    _add_stated(table, named or {})
     distortions = header_distortions(named[name] for name in np.unique(table["exposure"])) if named else {}
     matches = _finish(table, star, shapes, headers, left_out, epoch, distortions)
     return replace(matches, left_out=copies | left_out, camera=camera)
@@ -291,12 +295,25 @@ def _check_measured(detections):
         raise InputError("match takes the table that measure makes of exposures: call match(measure(exposures))")
 
 
-def _add_epochs(table, named):
+def _add_numbers(table, named, keywords):
+    """Add a column for every keyword with a number in the headers of exposures, if the table has none of that name."""
+    lacking = [keyword for keyword in keywords or () if keyword not in table.colnames]
+    if lacking and not named:
+        raise InputError(
+            f"keywords: {lacking[0]} is to be read from headers, and there are no frames: give them, exposures= "
+            "(--wcs FRAME ...), or a column of that name"
+        )
+    for keyword, numbers in stated_numbers(named.values(), lacking).items():
+        table[keyword] = [numbers.get(name, np.nan) for name in table["exposure"]]
+
+
+def _add_stated(table, named, keywords=None):
     """Add the column ``epoch`` [yr] if headers state it and the table does not; NaN where one does not.
 
     Also ``tan_z`` and ``parallactic_angle`` [deg], as refraction needs them; from place, time and site for stars with
     colours alone.
     """
+    _add_numbers(table, named, keywords)
     epochs = {name: header_epoch(exposure.header) for name, exposure in named.items()}
     if any(epoch is not None for epoch in epochs.values()) and "epoch" not in table.colnames:
         years = {name: np.nan if epoch is None else epoch for name, epoch in epochs.items()}

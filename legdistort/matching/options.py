@@ -36,6 +36,7 @@ class MatchOptions:
     reject_flags: int = UNUSABLE
     isolation: float | None = LIMIT
     start: Any = None
+    keywords: Any = None
     progress: bool = False
 
     def __post_init__(self):
@@ -49,5 +50,11 @@ class MatchOptions:
         if not isinstance(self.reject_flags, Integral):
             raise InputError(f"reject_flags must be an integer, whose bits are flags, got {self.reject_flags!r}")
         check_isolation(self.isolation)
+        keywords = (self.keywords,) if isinstance(self.keywords, str) else self.keywords or ()
+        if not (
+            isinstance(keywords, list | tuple) and all(isinstance(each, str) and each.strip() for each in keywords)
+        ):
+            raise InputError(f"keywords must be names of header keywords, got {self.keywords!r}")
+        object.__setattr__(self, "keywords", tuple(keywords) or None)
         if self.start is not None:
             object.__setattr__(self, "start", given_starts(self.start))

@@ -54,57 +54,66 @@ def three():
 # --- the chain of nights ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("rate", "walk"), [(0.0, 0.0), (0.0, 0.3), (0.2, 0.0), (0.2, 0.3)])
-def test_a_chain_is_a_dense_least_squares(rate, walk):
-    """Of S at all dates and one more, and of a rate, with nights that determine part of S alone."""
+@pytest.mark.parametrize(
+    ("rate", "walk", "slope"),
+    [(0, 0, 0), (0, 0.3, 0), (0.2, 0, 0), (0.2, 0.3, 0), (0, 0, 0.4), (0.2, 0.3, 0.4)],
+)
+def test_a_chain_is_a_dense_least_squares(rate, walk, slope):
+    """Of S at all dates and one more, of a rate, and of slopes, with nights that determine part of S alone."""
     rng, n, k = np.random.default_rng(3), 5, 4
     dates, asked = np.array([2001.0, 2000.0, 2003.5, 2001.0, 2006.0]), 2002.2
-    roots = rng.normal(size=(n, k, k))
-    roots[:, -1] = 0
+    x, wanted = np.array([0.5, -1.0, 0.2, 1.5, -1.2]), 0.7
+    roots = rng.normal(size=(n, 2 * k, 2 * k))
+    roots[:, [k - 1, 2 * k - 1]] = 0
+    if not slope:
+        roots = roots[:, :k]
     information, scatter2 = roots @ roots.mT, rng.uniform(0.1, 1, (n, k))
-    pull = np.einsum("nkl,nl->nk", information, rng.normal(size=(n, k)))
-    chain = Chain(information, pull, scatter2, dates, rate, walk)
+    pull = np.einsum("nkl,nl->nk", information, rng.normal(size=information.shape[:2]))
+    chain = Chain(information, pull, scatter2, dates, rate, walk, slope, x)
     times = np.unique([*dates, asked])
 
-    def dense(date, used):
-        # z: S without its rate at all times, the rate, B of every night
-        size = k * (len(times) + 1 + n)
+    def dense(date, x_there, used):
+        # z: S without its rate at all times, the rate, B of every night, T
+        size = k * (len(times) + 2 + n)
         place = {t: np.arange(k) + k * i for i, t in enumerate(times)}
-        slope = np.arange(k) + k * len(times)
+        slopes = np.arange(k) + k * len(times)
         whole, right = np.zeros((size, size)), np.zeros(size)
 
-        def row(time, b=None):
-            out = np.zeros((k, size))
-            out[:, place[time]] = np.eye(k)
-            out[:, slope] = (time - dates.mean()) * np.eye(k) if rate else 0
+        def row(time, number, b=None):
+            out = np.zeros((2 * k, size))
+            out[:k, place[time]] = np.eye(k)
+            out[:k, slopes] = (time - dates.mean()) * np.eye(k) if rate else 0
+            out[:k, -k:], out[k:, -k:] = number * np.eye(k), np.eye(k)
             if b is not None:
-                out[:, k * (len(times) + 1 + b) + np.arange(k)] = np.eye(k)
-            return out
+                out[:k, k * (len(times) + 1 + b) + np.arange(k)] = np.eye(k)
+            return out if slope else out[:k]
 
         for i in used:
-            seen = row(dates[i], i)
+            seen = row(dates[i], x[i], i)
             whole += seen.T @ information[i] @ seen
             right += seen.T @ pull[i]
         for i in range(n):
             own = k * (len(times) + 1 + i) + np.arange(k)
             whole[own, own] += 1 / scatter2[i]
-        whole[slope, slope] += 1 / (rate**2 or 1)
+        whole[slopes, slopes] += 1 / (rate**2 or 1)
+        own = np.arange(size - k, size)
+        whole[own, own] += 1 / ((10 * slope) ** 2 or 1e-12)
         whole[place[times[0]], place[times[0]]] += 1e-6
         for early, late in pairwise(times):
             step = np.zeros((k, size))
             step[:, place[late]], step[:, place[early]] = np.eye(k), -np.eye(k)
             whole += step.T @ step / ((walk**2 or 1e-12) * (late - early))
-        seen, covariance = row(date), np.linalg.inv(whole)
+        seen, covariance = row(date, x_there), np.linalg.inv(whole)
         return seen @ covariance @ right, seen @ covariance @ seen.T
 
-    known = slice(0, k - 1)  # nights say nothing of the last
+    known = np.delete(np.arange(information.shape[1]), k - 1)  # nights say nothing of the last of S
     for found, expected in [
-        (chain.at(asked), dense(asked, range(n))),
-        *[(chain.others[i], dense(dates[i], [j for j in range(n) if j != i])) for i in range(n)],
+        (chain.at(asked, wanted), dense(asked, wanted, range(n))),
+        *[(chain.others[i], dense(dates[i], x[i], [j for j in range(n) if j != i])) for i in range(n)],
     ]:
         assert_allclose(found[0][known], expected[0][known], atol=2e-4)
-        assert_allclose(found[1][known, known], expected[1][known, known], atol=2e-4)
-        assert found[1][-1, -1] > 1e4
+        assert_allclose(found[1][np.ix_(known, known)], expected[1][np.ix_(known, known)], atol=2e-4)
+        assert found[1][k - 1, k - 1] > 1e4
 
 
 def linear_nights(seed, n, *, scatter=0.02, rate=0.0, odd=None, unknown=2):
@@ -126,7 +135,7 @@ def squares(sets, date):
     """Squared error of S at a date, and its stated variance, summed; and how many sets have a drift."""
     sums = np.zeros(3)
     for true, slope, dates, nights in sets:
-        chain, _, _ = fitted(nights, dates, DEGREES)
+        chain, *_ = fitted(nights, dates, DEGREES)
         mean, covariance = chain.at(date)
         away = mean + nights[0][0] - true - slope * (date - 2017)
         sums += np.sum(away**2), np.trace(covariance), chain.rate > 0

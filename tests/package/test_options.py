@@ -441,6 +441,7 @@ MATCH = [
     row(reject_flags=0),
     row(isolation=None),
     row(start={"exp00": (0.0, 0.0), "exp01": (3.0, -2.0, 10.0)}),
+    row(keywords=["ROTPPOSN"], refused={"": "no header states ROTPPOSN as a number|to be read from headers"}),
     row(progress=True),
 ]
 MEASURE = [

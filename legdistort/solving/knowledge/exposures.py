@@ -1,8 +1,8 @@
 """Departures of exposures from the static distortion of their detector, and what is known of that, as factors.
 
 ``A_i = S_g + B_n + d_i`` with ``d_i ~ N(0, Lambda)``, Lambda by degree, ``B_n ~ N(0, Lambda_n)`` for the night n of
-exposure i, where there are several, and ``S_g ~ N(m_g, V_g)`` for its detector g. Similarities of single exposures are
-free.
+exposure i, where there are several, and ``S_g ~ N(m_g, V_g)`` for its detector g. Where a number x_i of every exposure
+is given, S_g + x_i T_g takes the place of S_g. Similarities of single exposures are free.
 """
 
 from dataclasses import dataclass, replace
@@ -25,7 +25,8 @@ class ExposureModel:
     """Data on the coefficients of exposures, and the static distortions that these scatter about.
 
     The unknowns are the coefficients of every exposure but its similarity, from where they are, by exposure and in the
-    order of `dynamic_basis`; then what those of a night have in common; then those of the statics, from the prior mean.
+    order of `dynamic_basis`; then what those of a night have in common; then those of the statics, from the prior mean;
+    then those of their slopes, if there are any.
 
     Attributes
     ----------
@@ -40,6 +41,8 @@ class ExposureModel:
         See `Problem.nights`.
     night_sigma : float or None
         Scatter of nights; None: found.
+    number : ndarray, shape (n_exposures,), or None
+        Of every exposure, on which the static distortions depend linearly; None: they do not.
     """
 
     data: ReducedData
@@ -48,6 +51,7 @@ class ExposureModel:
     degrees: np.ndarray
     night: np.ndarray | None = None
     night_sigma: float | None = None
+    number: np.ndarray | None = None
 
     @classmethod
     def of(cls, problem, state, motion, group):
@@ -84,18 +88,27 @@ class ExposureModel:
         return 0 if self.night is None else int(self.night.max()) + 1
 
     @property
+    def n_slopes(self):
+        """Number of slopes of static distortions."""
+        return 0 if self.number is None else self.n_groups
+
+    @property
     def n_scatters(self):
         """Number of sizes that are scatters of exposures and nights."""
         return int(self.degrees.max(initial=0)) * (1 + (self.n_nights > 0 and self.night_sigma is None))
 
     @cached_property
     def departures(self):
-        """The factor on A_i - S_g - B_n, and that on B_n, whose sizes are numbered by degree."""
+        """The factor on A_i - S_g - x_i T_g - B_n, and that on B_n, whose sizes are numbered by degree."""
         n, k = self.departure.shape
-        parts = [sparse.eye_array(n * k)]
-        for owner, number in ((self.night, self.n_nights), (self.group, self.n_groups)):
-            if number:
-                theirs = sparse.csr_array((-np.ones(n), (range(n), owner)), (n, number))
+        parts, ones = [sparse.eye_array(n * k)], np.ones(n)
+        for owner, count, share in (
+            (self.night, self.n_nights, ones),
+            (self.group, self.n_groups, ones),
+            (self.group, self.n_slopes, self.number),
+        ):
+            if count:
+                theirs = sparse.csr_array((-share, (range(n), owner)), (n, count))
                 parts.append(sparse.kron(theirs, np.eye(k)))
         size = np.tile(self.degrees - 1, n)
         rows = sparse.hstack(parts, format="csr")
@@ -105,9 +118,8 @@ class ExposureModel:
     @cached_property
     def nights(self):
         """The factor on B_n."""
-        n, k = self.departure.shape
-        m = self.n_nights * k
-        rows = sparse.eye_array(m, (n + self.n_nights + self.n_groups) * k, k=n * k, format="csr")
+        k = len(self.degrees)
+        m, rows = self.n_nights * k, self._rows(len(self.departure), self.n_nights)
         found = self.night_sigma is None
         size = np.tile(self.degrees - 1 + self.degrees.max(), self.n_nights) if found else np.full(m, GIVEN)
         return Factor("nights", rows, np.zeros(m), np.full(m, 1.0 if found else self.night_sigma), size)
@@ -117,13 +129,23 @@ class ExposureModel:
 
         Widths are those along `directions` (n_groups, K, K), columns; of the coefficients if they are not given.
         """
-        n, k = self.departure.shape
-        m = self.n_groups * k
-        rows = sparse.eye_array(m, (n + self.n_nights + self.n_groups) * k, k=(n + self.n_nights) * k, format="csr")
+        k = len(self.degrees)
+        m, rows = self.n_groups * k, self._rows(len(self.departure) + self.n_nights, self.n_groups)
         if directions is not None:
             rows = sparse.csr_array(sparse.block_diag(np.linalg.inv(directions)) @ rows)
         widths = np.broadcast_to(width, (self.n_groups, k)).ravel()
         return Factor("static distortion", rows, np.zeros(m), widths, np.full(m, size))
+
+    def slopes(self, *, size=GIVEN, width=np.nan):
+        """The factor on T_g: of one size that is found, or of a given width."""
+        m = self.n_slopes * len(self.degrees)
+        rows = self._rows(len(self.departure) + self.n_nights + self.n_groups, self.n_slopes)
+        return Factor("slopes of the static distortion", rows, np.zeros(m), np.full(m, width), np.full(m, size))
+
+    def _rows(self, first, count):
+        """The unknowns of so many owners, from the first on: rows (count K, n)."""
+        k, whole = len(self.degrees), len(self.departure) + self.n_nights + self.n_groups + self.n_slopes
+        return sparse.eye_array(count * k, whole * k, k=first * k, format="csr")
 
     @cached_property
     def posterior(self):
