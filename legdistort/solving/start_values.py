@@ -15,8 +15,8 @@ from .equations.star_terms import outer_packed, packed, symmetric_times
 
 #: Distances that the typical one of an exposure is found from.
 _ENOUGH = 300
-#: Order in its slopes to which a distortion is taken out for a start; of one that was solved for, with stars that are to
-#: be where they were then.
+#: Order in its slopes to which a distortion is taken out for a start; of one that was solved for, with stars that are
+#: to be where they were then.
 _ROUGHLY, _CLOSELY = 2, 8
 
 

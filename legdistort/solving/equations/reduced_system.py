@@ -447,6 +447,6 @@ class Iterative(Reduced):
 
 
 def _lanczos(lengths, ratios):
-    """Diagonal and off-diagonal of Lanczos' matrix, of the lengths of the steps of conjugate gradients and the ratios."""
+    """Diagonal and off-diagonal of Lanczos' matrix, see `Iterative._weakest`."""
     inverse, ratios = 1 / np.array(lengths), np.array(ratios[:-1])
     return inverse + np.append(0.0, ratios * inverse[:-1]), -np.sqrt(ratios) * inverse[:-1]
