@@ -245,9 +245,9 @@ class _Descent:
                 here = self.convention.violation(_departure(self.problem, self.state))
                 self.convention = replace(self.convention, values=here)
         self.made = None
-        self.stepping = (
-            self.stepping.moved(self.weighted, self.blocks, self.convention) if near or self.on_trial else None
-        )
+        if self.stepping is not None:
+            serves = near or self.on_trial or self.stepping.moves_exactly
+            self.stepping = self.stepping.moved(self.weighted, self.blocks, self.convention) if serves else None
 
     @property
     def system(self):
@@ -282,7 +282,8 @@ class _Descent:
 
     def descend(self, max_iterations):
         """Iterate until the next step would be below the tolerance."""
-        accuracy, size = 1e-3 if self.blocks.coupling.dtype == np.float32 else 1e-5, self.size
+        loose = self.blocks.coupling.dtype == np.float32 and self.problem.begun is None
+        accuracy, size = 1e-3 if loose else 1e-5, self.size
         tolerance, enough = self.rules.tolerance, _ENOUGH * self.rules.tolerance
         for count in range(max_iterations):
             _count.get()()

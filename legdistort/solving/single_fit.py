@@ -37,10 +37,18 @@ SHOWN, SHOWN_BY_MISFIT = 1.0, 0.25
 _FREER = 0.5
 
 
+@contextlib.contextmanager
 def threads(matches):
     """One thread for linear algebra, but for large matrices where no compiled loops use all cores beside it."""
-    many = len(matches.names) > _MANY_EXPOSURES and not uses_compiled_loops(len(matches.table))
-    return contextlib.nullcontext() if many else parallel.one_blas_thread()
+    with contextlib.ExitStack() as stack:
+        if uses_compiled_loops(len(matches.table)):
+            from .equations.compiled import threads_kept
+
+            stack.enter_context(threads_kept())
+            stack.enter_context(parallel.one_blas_thread())
+        elif len(matches.names) <= _MANY_EXPOSURES:
+            stack.enter_context(parallel.one_blas_thread())
+        yield
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,12 +329,14 @@ def _first(matches, given, start, plain, common, clip):
     The fit and the beginning are None where there is none.
     """
     problem, near = given, None
-    if plain is not None and not clipping.is_explained(problem, plain, clip=clip):
+    explained = plain is not None and clipping.is_explained(problem, plain, clip=clip)
+    if plain is not None and not explained:
         near = clipping.start_from(problem, plain)
         if near is None or clipping.is_misfit(problem, plain):
             problem, plain, found = _unbent(matches, given, start, plain, common, loss="cauchy")
             near = near if problem is given else found
-    if plain is None or not clipping.is_explained(problem, plain, clip=clip):
+            explained = plain is not None and clipping.is_explained(problem, plain, clip=clip)
+    if not explained:
         return problem, plain, near, False
     problem, plain, _ = _unbent(matches, given, start, plain, common, or_else=problem, clip=clip)
     return problem, plain, near, True

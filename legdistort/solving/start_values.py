@@ -15,6 +15,9 @@ from .equations.star_terms import outer_packed, packed, symmetric_times
 
 #: Distances that the typical one of an exposure is found from.
 _ENOUGH = 300
+#: Order in its slopes to which a distortion is taken out for a start; of one that was solved for, with stars that are
+#: to be where they were then.
+_ROUGHLY, _CLOSELY = 2, 8
 
 
 def start(problem, nominal, *, robust=False):
@@ -41,7 +44,7 @@ def start(problem, nominal, *, robust=False):
     """
     _check_prior(problem)
     begun = problem.prior_mean if problem.begun is None or problem.fixed is not None else problem.begun
-    q = undistorted(replace(problem, prior_mean=begun))
+    q = undistorted(replace(problem, prior_mean=begun), _ROUGHLY if begun is problem.prior_mean else _CLOSELY)
     full = problem.weight[:2].sum(axis=0) / 2
     current, weight = np.array(nominal, dtype=float), full
     n_sweeps = 12 if robust else 1
@@ -85,23 +88,24 @@ def _check_prior(problem):
             raise SolveError(f"the prior is not usable: {error}") from None
 
 
-def undistorted(problem):
-    """Positions (2, n) with the prior distortion taken out to second order, which is enough for a start."""
+def undistorted(problem, order=_ROUGHLY):
+    """Positions (2, n) with the prior distortion taken out to some order in its slopes."""
     if not np.any(problem.prior_mean):
         return problem.xy
     if problem.uses_compiled_loops:
         from .equations import compiled
 
-        return compiled.undistorted(problem)
+        return compiled.undistorted(problem, order)
     q, n = np.empty_like(problem.xy), problem.n_exposures
     alike = [(shape, mean.tobytes()) for shape, mean in zip(problem.shapes, problem.prior_mean, strict=True)]
     ends = [i for i in range(1, n) if alike[i] != alike[i - 1]]
     for first, last in itertools.pairwise([0, *ends, n]):  # exposures of one prior are done together
         distortion = Distortion(problem.prior_mean[first], problem.shapes[first])
         part = slice(problem.start[first], problem.start[last])
-        x = problem.xy[:, part].T
-        guess = 2 * x - distortion(x)
-        q[:, part] = (x - distortion(guess) + guess).T
+        found = x = problem.xy[:, part].T
+        for _ in range(order):
+            found = x - distortion(found) + found
+        q[:, part] = found.T
     return q
 
 

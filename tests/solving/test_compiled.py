@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from legdistort.geometry.distortion import Distortion
 from legdistort.priors.prior import Prior
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving import start_values
@@ -72,6 +73,18 @@ def test_compiled_start_is_the_plain_one(monkeypatch, robust):
     assert_allclose(fast.poses, plain.poses, atol=1e-8)
     assert_allclose(also_astray, astray, atol=1e-8)
     assert astray.max() < 5
+
+
+def test_compiled_inverse_is_the_plain_one(monkeypatch):
+    """To a high order it is exact."""
+    sim, prior = _set(sigma=0.05)
+    problem = build_problem(sim.matches, 3, prior=prior)
+    plain = start_values.undistorted(problem, 8)
+    monkeypatch.setattr("legdistort.solving.equations.problem.COMPILED_FROM", 0)
+    assert_allclose(start_values.undistorted(problem, 8), plain, atol=1e-8)
+    first = problem.part(0)
+    there = Distortion(problem.prior_mean[0], problem.shapes[0])(plain[:, first].T)
+    assert_allclose(there.T, problem.xy[:, first], atol=1e-6)
 
 
 def test_typical_distances_are_those_of_all_stars(monkeypatch):

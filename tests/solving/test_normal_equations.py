@@ -363,6 +363,24 @@ def test_conjugate_gradients_work_out_no_more_than_is_enough(case, off):
     assert count.n == (off != 0)
 
 
+def test_weak_directions_that_were_met_take_no_iterations_again():
+    """At a state nearby, with other weights: the same step as from nothing."""
+    problem, state = make()
+    blocks = criterion.linearise(problem, state)
+    gauge = constraints.make("minimal", problem, state, blocks)
+    target = np.zeros(gauge.n_constraints)
+    system = Iterative(problem, blocks, gauge)
+    system.step(target, 1e-9, 1e-6)
+    other = problem.scaled(1 + 0.05 * np.sin(np.arange(problem.xy.shape[1])))
+    blocks = criterion.linearise(other, replace(state, stars=state.stars + 0.01))
+    exact, counts = Direct(other, blocks, gauge).step(target, 0.0)[1], []
+    for way in (Iterative(other, blocks, gauge), system.moved(other, blocks, gauge)):
+        way._couple = count = Counted(way._couple)
+        assert_allclose(way.step(target, 1e-9, 1e-6)[1], exact, atol=1e-5 * np.abs(exact).max())
+        counts.append(count.n)
+    assert counts[1] < 0.7 * counts[0]
+
+
 class Counted:
     """A function that counts its calls."""
 

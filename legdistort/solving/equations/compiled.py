@@ -10,6 +10,8 @@ anything determines, and steps along these need all digits.
 
 import itertools
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
 
 import numpy as np
 from numba import config
@@ -22,6 +24,8 @@ THREADS_FROM = 200_000
 _BATCH = 128
 #: Bytes of a line of the cache. A vector that crosses the end of one takes twice as long to load or store.
 _LINE = 64
+#: Threads that are kept, see `threads_kept`.
+_kept = ContextVar("kept", default=None)
 _FAST = {"contract", "reassoc", "nsz"}  # sums may be reordered; NaN and infinity keep their meaning
 
 
@@ -45,9 +49,21 @@ def _shared_out(function, chunks, *outputs):
     first, *others = [(low, high, *each) for (low, high), *each in zip(chunks, *outputs, strict=True)]
     if not others:
         return [function(*first)]
-    with ThreadPoolExecutor(len(others)) as threads:
+    kept = _kept.get()
+    with ThreadPoolExecutor(len(others)) if kept is None else nullcontext(kept) as threads:
         later = [threads.submit(function, *call) for call in others]
         return [function(*first), *(each.result() for each in later)]
+
+
+@contextmanager
+def threads_kept():
+    """Keep the threads that begin in the block to its end: many short calls spend their time on new ones otherwise."""
+    with ThreadPoolExecutor(config.NUMBA_NUM_THREADS) as threads:
+        before = _kept.set(threads)
+        try:
+            yield
+        finally:
+            _kept.reset(before)
 
 
 @compiled_loop(nogil=True)
@@ -310,7 +326,7 @@ def _displaced(a, orders, size, x, q, work):
 
 
 @compiled_loop(nogil=True, fastmath=_FAST)
-def _undistorted(low, high, out, start, xy, coefficients, sizes, orders):
+def _undistorted(low, high, out, order, start, xy, coefficients, sizes, orders):
     top = orders.max() + 1
     x, q = _workspace(2), _workspace(2)
     work = (_recurrence(top), _workspace(top), _workspace(top), _workspace(top), _workspace(top), _workspace(2))
@@ -323,8 +339,8 @@ def _undistorted(low, high, out, start, xy, coefficients, sizes, orders):
                 for o in range(size):
                     x[axis, o] = seen[o]
             q[:] = x
-            _displaced(coefficients[i], orders, sizes[i], x, q, work)
-            _displaced(coefficients[i], orders, sizes[i], x, q, work)
+            for _ in range(order):
+                _displaced(coefficients[i], orders, sizes[i], x, q, work)
             for axis in range(2):
                 found = out[axis, first : first + size]
                 for o in range(size):
@@ -416,11 +432,11 @@ def to_exposures(problem, blocks, y):
     return out.reshape(len(out), -1)
 
 
-def undistorted(problem):
+def undistorted(problem, order):
     """Twin of `legdistort.solving.start_values.undistorted`."""
     orders = np.stack(basis.orders(basis.degree_of(problem.prior_mean.shape[2])))
     out, sizes = np.empty_like(problem.xy), np.ascontiguousarray(problem.size[:, ::-1])
-    given = out, problem.start, problem.xy, problem.prior_mean, sizes, orders
+    given = out, order, problem.start, problem.xy, problem.prior_mean, sizes, orders
     _shared_out(lambda *chunk: _undistorted(*chunk, *given), _chunks(problem))
     return out
 

@@ -11,7 +11,7 @@ import logging
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, eigvalsh_tridiagonal
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, eigh_tridiagonal, eigvalsh_tridiagonal
 from scipy.linalg.blas import dgemm, dtrsm
 from scipy.linalg.lapack import dpotri
 
@@ -38,6 +38,8 @@ _LEAST_PIVOT = 1e-7  # of the normalised equations, below which they count as si
 _ALONE = 1e-6  # of what the stars would determine if they were known: where nothing else does, as in one exposure
 _ROUNDING = 1e-12  # of a variance, what is left where the constraints hold all of it
 _SHOWN = 9.0  # squares that a common distortion which is held costs, in errors, from which the residuals show it
+_WEAK, _SURE = 0.3, 0.3  # eigenvalues below which directions are learnt, where they lack no more than this part of it
+_REMEMBERED = 100  # iterations, and directions
 _NOTHING = 1e-9  # eigenvalue of the normalised equations that is rounding
 
 
@@ -301,19 +303,31 @@ class Iterative(Reduced):
 
     Projected conjugate gradients with the constraint preconditioner of Gould, Hribar & Nocedal (2001): every
     iterate satisfies the constraints. The coupling E d of the iterate is carried along, so that neither the
-    right-hand side nor the stars need a pass of their own.
+    right-hand side nor the stars need a pass of their own. Directions that are common to all exposures, and that the
+    constraints hardly hold, take most of the iterations; what these tell of them is kept for the system at the next
+    state, as a limited-memory preconditioner (Tshimanga, Gratton, Weaver & Sartenaer 2008).
     """
 
     moves_exactly = True  # but for the preconditioner all is that of the new state
     _met = 0.0  # see `_weakest`
+    _learnt, _softest = None, 1.0  # see `_learn`
 
     def __init__(self, problem, blocks, gauge):
         super().__init__(problem, blocks, gauge)
         self._block_inverses = elimination.inverse_exposure_blocks(blocks.u)
         self.scale = np.einsum("iaa->", blocks.u) / self.unknowns.size
 
+    def moved(self, problem, blocks, gauge):
+        """As for `Reduced`."""
+        out = super().moved(problem, blocks, gauge)
+        out._block_inverses = elimination.inverse_exposure_blocks(blocks.u)
+        return out
+
     def _block_solve(self, r):
-        return np.einsum("iab,ib->ia", self._block_inverses, r.reshape(self.blocks.g_exposure.shape)).ravel()
+        """The preconditioner: blocks of the exposures, and directions that are learnt, of r (n,) or (n, k)."""
+        by_exposure = r.reshape(*self._block_inverses.shape[:2], -1)
+        out = (self._block_inverses @ by_exposure).reshape(r.shape)
+        return out if self._learnt is None else out + self._learnt @ (self._learnt.T @ r)
 
     def settle(self, own, stars, accuracy=1e-8):
         """As for `Direct`."""
@@ -356,8 +370,7 @@ class Iterative(Reduced):
 
         None if it takes more than `limit` iterations.
         """
-        by_exposure = rows.T.reshape(*self._block_inverses.shape[:2], -1)
-        lifted = (self._block_inverses @ by_exposure).reshape(-1, len(rows))
+        lifted = self._block_solve(rows.T)
         border = np.linalg.inv(rows @ lifted)
 
         def precondition(r):
@@ -371,13 +384,15 @@ class Iterative(Reduced):
         z = precondition(r)
         p, rz = z, r @ z
         goal = max(tolerance**2 * rz, 1e-16 * len(r))  # r'z is in units of chi2: below, only rounding is left
-        enough2, lengths, ratios = enough**2 * (len(r) + g_star.size), [], []
+        enough2, lengths, ratios, met = enough**2 * (len(r) + g_star.size) * self._softest, [], [], []
         for count in range(max_iterations):
             if rz <= goal or (rz <= enough2 and rz <= enough2 * self._weakest(lengths, ratios) ** 2):
                 log.debug("conjugate gradients: %d steps", count)
                 break
             if count == limit:
                 return None
+            if count < _REMEMBERED:
+                met.append(z / np.sqrt(rz))
             ep = self._couple(p)
             sp = self._gradient(self._own(p), ep)
             length = rz / (p @ sp)
@@ -391,8 +406,9 @@ class Iterative(Reduced):
             ratios.append(rz / old)
         else:
             log.info("conjugate gradients stopped after %d steps at %.1e of the start", max_iterations, np.sqrt(rz))
-        if enough:
-            self._weakest(lengths, ratios)  # for the next step
+        if enough:  # for the next step
+            self._weakest(lengths, ratios)
+            self._learn(met, lengths, ratios)
         return self._stars(stars), d
 
     def _weakest(self, lengths, ratios):
@@ -402,9 +418,35 @@ class Iterative(Reduced):
         2013, section 11.3): by its inverse a step is larger than the gradient tells.
         """
         if lengths:
-            inverse, ratios = 1 / np.array(lengths), np.array(ratios[:-1])  # the last may be rounding
-            diagonal = inverse + np.append(0.0, ratios * inverse[:-1])
-            off = np.sqrt(ratios) * inverse[:-1]
-            least = eigvalsh_tridiagonal(diagonal, off, select="i", select_range=(0, 0))[0]
+            least = eigvalsh_tridiagonal(*_lanczos(lengths, ratios), select="i", select_range=(0, 0))[0]
             self._met = min(max(least, 0.0), self._met or np.inf)
         return self._met
+
+    def _learn(self, met, lengths, ratios):
+        """Keep the weak directions that conjugate gradients have met, so that they are no weaker than others next time.
+
+        Parameters
+        ----------
+        met : list of ndarray, shape (n,)
+            Preconditioned residuals of the first iterations, of unit length in the preconditioner: Lanczos' vectors.
+        lengths, ratios : list of float
+            Of their steps, and of the squares of the residuals.
+        """
+        n = min(len(met), len(lengths) - 1)  # the last may be rounding
+        if n < 2 or (self._learnt is not None and self._learnt.shape[1] > _REMEMBERED):
+            return
+        values, vectors = eigh_tridiagonal(*_lanczos(lengths[:n], ratios[:n]))
+        lacking = np.sqrt(ratios[n - 1]) / lengths[n - 1] * np.abs(vectors[-1])  # residuals of the eigenvectors
+        sure = (values > _NOTHING) & (values < _WEAK) & (lacking < _SURE * values)
+        if sure.any():
+            values, vectors, self._met = values[sure], vectors[:, sure], values[~sure].min(initial=_WEAK)
+            made = np.array(met[:n]).T @ (vectors * np.sqrt(1 / values - 1))
+            self._learnt = made if self._learnt is None else np.hstack([self._learnt, made])
+            size = self._learnt.T @ np.stack([self._own(each).ravel() for each in self._learnt.T], axis=1)
+            self._softest = 1 / (1 + np.linalg.eigvalsh(size)[-1])
+
+
+def _lanczos(lengths, ratios):
+    """Diagonal and off-diagonal of Lanczos' matrix, see `Iterative._weakest`."""
+    inverse, ratios = 1 / np.array(lengths), np.array(ratios[:-1])
+    return inverse + np.append(0.0, ratios * inverse[:-1]), -np.sqrt(ratios) * inverse[:-1]
