@@ -50,7 +50,8 @@ class MatchOptions:
         if not isinstance(self.reject_flags, Integral):
             raise InputError(f"reject_flags must be an integer, whose bits are flags, got {self.reject_flags!r}")
         check_isolation(self.isolation)
-        keywords = (self.keywords,) if isinstance(self.keywords, str) else self.keywords or ()
+        keywords = () if self.keywords is None else self.keywords
+        keywords = (keywords,) if isinstance(keywords, str) else keywords
         if not (
             isinstance(keywords, list | tuple) and all(isinstance(each, str) and each.strip() for each in keywords)
         ):
