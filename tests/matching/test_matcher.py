@@ -68,7 +68,7 @@ def test_field(cell, flips, headers):
 
 @pytest.mark.parametrize(
     "cell",
-    [pytest.param(cell, marks=pytest.mark.sets if k % 20 else pytest.mark.slow) for k, cell in enumerate(CELLS)],
+    [pytest.param(cell, marks=pytest.mark.sets if k else pytest.mark.slow) for k, cell in enumerate(CELLS)],
     ids=str,
 )
 def test_other_fields(cell):

@@ -192,7 +192,7 @@ def test_starting_point(paper):
         assert other[1] == pytest.approx(zero[1], rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.LegdistortWarning")
 def test_twin_of_the_gems_data(paper, tmp_path):
     """The sizes drawn for 11 exposures are known to 15 %, the mean over n stars to std / sqrt(n)."""

@@ -107,8 +107,6 @@ SETTINGS = {
 QUICK = {"plain", "exact prior", "cauchy", "clipped", "motions", "reference", "static fitted", "scale"}
 #: Beside these, of those that are much like another.
 SLOW = {"evidence", "large distortions"}
-#: What a solution takes ten seconds with: its order is looked at.
-LONG = {"degree chosen"}
 
 
 def found(solution, names=None):
@@ -176,9 +174,7 @@ def cases(*without):
     ]
 
 
-@pytest.mark.parametrize(
-    ("setting", "seed"), [*cases(*LONG), *(pytest.param(each, 0, marks=pytest.mark.slow) for each in sorted(LONG))]
-)
+@pytest.mark.parametrize(("setting", "seed"), cases())
 def test_order_and_names(setting, seed, solved):
     one, first = solved(setting, seed)
     order = np.random.default_rng(0).permutation(len(one.columns["x"]))
