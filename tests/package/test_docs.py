@@ -137,8 +137,8 @@ def results(page, done):
     return place
 
 
-#: Pages whose commands other pages have, with other options.
-LIKE_OTHERS = {"command_line", "imager_frames", "swarp_headers"}
+#: Pages whose commands other pages or tests have, with other options; and the longest, whose nights tests have.
+LIKE_OTHERS = {"catalogue", "command_line", "imager_frames", "many_nights", "swarp_headers"}
 
 
 @pytest.mark.parametrize(
