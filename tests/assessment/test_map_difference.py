@@ -396,11 +396,11 @@ def test_chances_of_the_detectors_of_a_camera_are_even():
     assert 0.3 < np.mean(chances) < 0.7
 
 
-@pytest.mark.slow
-def test_chances_are_even_where_nights_scatter():
+@pytest.mark.parametrize("n_sets", [pytest.param(6, marks=pytest.mark.slow), pytest.param(12, marks=pytest.mark.sets)])
+def test_chances_are_even_where_nights_scatter(n_sets):
     """Six nights, the last two of which are turned. Were their exposures independent, p would be 1e-5 in one of ten."""
     chances = {"nights": [], "one": []}
-    for seed in range(12):
+    for seed in range(n_sets):
         nights = Nights(seed, nights=6, per=3, n_stars=100, nightly=0.04)
         known = ld.Prior(modes(nights.static), shape=SHAPE)
         for name, each in chances.items():

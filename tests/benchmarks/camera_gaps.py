@@ -27,15 +27,15 @@ SENSITIVITY, SKY = (1.0, 1.08, 0.96, 1.02), (100.0, 140.0, 80.0, 120.0)
 BRIGHT, APART = 10**4.6, 14.0
 
 
-def mosaic_of(folder, *, seed=5, sensitivity=SENSITIVITY):
-    """The night, the fluxes of its stars, and the run from its frames to the mosaic."""
+def mosaic_of(folder, *, seed=5, sensitivity=SENSITIVITY, **options):
+    """The night, the fluxes of its stars, and the run from its frames to the mosaic, with its options."""
     night = gsaoi_images.Night(n_exposures=EXPOSURES, n_stars=350, dither=5.0, dynamic=1.6, seed=seed)
     flux = 10 ** np.random.default_rng(seed).uniform(4.3, 5.6, len(night.sky))
     for i in range(EXPOSURES):
         images = night.images(i, size=SIZE, flux=flux, sensitivity=sensitivity, sky=SKY)
         images.writeto(Path(folder) / f"frame{i}.fits")
     frames, camera = str(Path(folder) / "*.fits"), ld.Camera.gsaoi(size=SIZE)
-    return night, flux, ld.run(frames, out=Path(folder) / "out", ext="SCI", camera=camera)
+    return night, flux, ld.run(frames, out=Path(folder) / "out", ext="SCI", camera=camera, **options)
 
 
 def on_true(night, solution):

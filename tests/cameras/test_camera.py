@@ -565,7 +565,7 @@ class TestFittedCamera:
         assert apart(solution.camera, gsaoi).max() < 0.05
         assert np.count_nonzero(~solution.residuals["used"]) < 0.03 * len(table)
 
-    @pytest.mark.slow
+    @pytest.mark.sets
     def test_static_distortions_from_nothing(self, gsaoi):
         """Self-calibration of a camera by large dithers and rolls; stars after a common map as if all were known."""
         night = gsaoi_images.Night(n_exposures=16, n_stars=600, dither=15.0, turn=0.8)

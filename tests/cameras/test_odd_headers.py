@@ -125,8 +125,11 @@ def sky_error(night, solution):
 OPTIONS = {}, {"static": "fit"}, {"layout_sigma": {"shift": 2.0, "rotation": 0.2}}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("options", OPTIONS, ids=str)
+@pytest.mark.parametrize(
+    "options",
+    [pytest.param(each, marks=pytest.mark.sets if k % 2 else pytest.mark.slow) for k, each in enumerate(OPTIONS)],
+    ids=str,
+)
 def test_it_has_no_vote_on_the_sky_whatever_is_fitted(night, matches, options):
     """A quarter of 45 px otherwise; the headers of seven exposures are 3 px off, each."""
     with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
@@ -196,7 +199,7 @@ def test_a_layout_that_is_held_and_wrong_is_the_cause(matches):
     assert {check.cure for check in wrong} == {"see camera first, which is the cause"}
 
 
-@pytest.mark.parametrize("seed", [40, pytest.param(61, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [40, pytest.param(61, marks=pytest.mark.sets)])
 @pytest.mark.parametrize("odd", [(22.0, -24.0, 0.0), pytest.param((0.0, 0.0, 0.0), marks=pytest.mark.slow)])
 def test_a_star_or_two_show_it(seed, odd):
     """If all that cross are far off; and what is held, or stated, is then not named as a cure of the few ties."""

@@ -786,7 +786,7 @@ def test_keck_lists_by_the_command_line(shared_data, tmp_path, capsys):
 def test_microobservatory_frames(shared_data, tmp_path, capsys):
     """Four raw, undersampled frames without a WCS, with hot pixels and a drift of 250 px."""
     frames = sorted((shared_data / "microobs_hatp32" / "frames").glob("*.fits.gz"))[::3]
-    how = ["--degree", "2", "--catalogue", "none", "--json", "--quiet"]
+    how = ["--degree", "2", "--threshold", "30", "--catalogue", "none", "--json", "--quiet"]
     assert main(["run", *map(str, frames), "--out", str(tmp_path / "out"), *how]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["n_exposures"] == 4
@@ -903,8 +903,8 @@ def test_widths_go_with_the_prior_of_headers(night, tmp_path, monkeypatch):
     ("terminal", "more", "shown"),
     [
         (True, [], True),
-        pytest.param(True, ["--quiet"], False, marks=pytest.mark.slow),
-        pytest.param(False, [], False, marks=pytest.mark.slow),
+        pytest.param(True, ["--quiet"], False, marks=pytest.mark.sets),
+        pytest.param(False, [], False, marks=pytest.mark.sets),
     ],
 )
 @pytest.mark.usefixtures("undrawn")

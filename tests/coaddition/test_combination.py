@@ -83,7 +83,7 @@ def test_flags_of_pixels_are_what_mosaics_say():
 
 class TestClipping:
     @pytest.mark.parametrize(
-        "k", [pytest.param(4, marks=pytest.mark.slow), 6, pytest.param(11, marks=pytest.mark.slow)]
+        "k", [pytest.param(4, marks=pytest.mark.sets), 6, pytest.param(11, marks=pytest.mark.slow)]
     )
     @pytest.mark.parametrize("known", [True, False])
     @pytest.mark.parametrize(

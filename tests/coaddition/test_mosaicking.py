@@ -415,8 +415,8 @@ class TestFile:
         [
             pytest.param((), marks=pytest.mark.slow),
             ("UNCERT", "MASK"),
-            pytest.param(["CONTEXT"], marks=pytest.mark.slow),
-            pytest.param("WEIGHT", marks=pytest.mark.slow),
+            pytest.param(["CONTEXT"], marks=pytest.mark.sets),
+            pytest.param("WEIGHT", marks=pytest.mark.sets),
         ],
     )
     def test_planes_that_are_asked_for(self, planes, tmp_path):

@@ -185,8 +185,8 @@ def gwcs_of_asdf(*keys):
     ("ending", "read"),
     [
         pytest.param("cal.fits", gwcs_of_fits, marks=pytest.mark.slow),
-        pytest.param("model.asdf", gwcs_of_asdf("meta", "wcs"), marks=pytest.mark.slow),
-        pytest.param("wcs.asdf", gwcs_of_asdf("wcs"), marks=pytest.mark.slow),
+        pytest.param("model.asdf", gwcs_of_asdf("meta", "wcs"), marks=pytest.mark.sets),
+        pytest.param("wcs.asdf", gwcs_of_asdf("wcs"), marks=pytest.mark.sets),
     ],
     ids=["frames", "models", "bare gwcs"],
 )

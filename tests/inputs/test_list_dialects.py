@@ -42,10 +42,10 @@ def test_every_dialect_is_read_and_its_damage_named(kind, tmp_path):
         outcomes.add(list_dialects.fault_of(seed, tmp_path, kind)[2])
 
 
-@pytest.mark.slow
-def test_two_thousand_lists():
-    counts, faults = list_dialects.fuzz(range(2000))
-    assert counts.total() == 2000
+@pytest.mark.parametrize("n", [pytest.param(500, marks=pytest.mark.slow), pytest.param(2000, marks=pytest.mark.sets)])
+def test_many_lists(n):
+    counts, faults = list_dialects.fuzz(range(n))
+    assert counts.total() == n
     assert not faults
 
 

@@ -58,7 +58,7 @@ def test_a_catalogue_of_other_stars_is_not_found(n_known):
 @pytest.mark.parametrize(
     ("n_sets", "n_known"),
     [
-        pytest.param(20, 40, marks=pytest.mark.slow),
+        pytest.param(6, 40, marks=pytest.mark.slow),
         *(pytest.param(100, n_known, marks=pytest.mark.sets) for n_known in (15, 40, 100)),
     ],
 )

@@ -73,8 +73,8 @@ def test_a_known_noise_needs_no_gain():
     [
         1e-30,
         pytest.param(1e-21, marks=pytest.mark.slow),
-        pytest.param(0.1, marks=pytest.mark.slow),
-        pytest.param(1e16, marks=pytest.mark.slow),
+        pytest.param(0.1, marks=pytest.mark.sets),
+        pytest.param(1e16, marks=pytest.mark.sets),
         1e22,
     ],
 )
@@ -104,9 +104,9 @@ def test_a_frame_is_the_same_in_any_unit(size, known):
     [
         1e-30,
         pytest.param(1e-21, marks=pytest.mark.slow),
-        pytest.param(3e-7, marks=pytest.mark.slow),
+        pytest.param(3e-7, marks=pytest.mark.sets),
         0.7,
-        pytest.param(1e5, marks=pytest.mark.slow),
+        pytest.param(1e5, marks=pytest.mark.sets),
         pytest.param(1e22, marks=pytest.mark.slow),
     ],
 )

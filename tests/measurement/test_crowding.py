@@ -119,8 +119,13 @@ def test_unresolved_pairs_are_deformed_and_single_stars_are_not():
     assert not is_isolated(table)[deformed].any()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("shape", "least"), [({"elongation": 2.0}, 0.4), ({"coma": 0.4}, 0.9)])
+@pytest.mark.parametrize(
+    ("shape", "least"),
+    [
+        pytest.param({"elongation": 2.0}, 0.4, marks=pytest.mark.sets),
+        pytest.param({"coma": 0.4}, 0.9, marks=pytest.mark.slow),
+    ],
+)
 def test_shapes_that_vary_over_the_field_make_no_star_deformed(shape, least):
     """Behind adaptive optics, images elongated and lopsided off the axis; one star in eight has a companion."""
     rng, size = np.random.default_rng(14), 1024

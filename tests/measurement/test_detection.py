@@ -136,7 +136,7 @@ def test_narrow_and_wide_stars_are_found_once(fwhm):
 
 
 @pytest.mark.parametrize(
-    "saturated", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.slow)]
+    "saturated", [pytest.param(False, marks=pytest.mark.sets), pytest.param(True, marks=pytest.mark.slow)]
 )
 def test_one_width_and_one_position_in_all_cut_outs_of_a_crowded_field(saturated):
     """The same pixels in four frames, undersampled; the brightest stars have flat tops, and no header says so."""

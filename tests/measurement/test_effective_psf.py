@@ -198,15 +198,18 @@ def test_the_centre_is_core_weighted(made, psf):
     assert np.abs(psf.centre(places)).max() < 0.05
 
 
-@pytest.mark.slow
-def test_pulls_over_many_frames():
+@pytest.mark.parametrize(
+    ("n_frames", "tolerance"),
+    [pytest.param(3, 0.08, marks=pytest.mark.slow), pytest.param(8, 0.05, marks=pytest.mark.sets)],
+)
+def test_pulls_over_many_frames(n_frames, tolerance):
     """Pull 1 +- 0.05 at every brightness, and the bound, with 49 and with 30 stars.
 
     As far as the noise allows: a fit with the true PSF to the same pixels has 1 within 0.06 in a third.
     """
     for n in (49, 30):
         parts = []
-        for seed in range(1, 9):
+        for seed in range(1, 1 + n_frames):
             exposure, xy, covariance, ratio = night(seed, n)
             star, best, own = ratios(ld.measure(exposure, psf="effective"), xy, covariance)
             parts.append(np.column_stack([ratio[star], best, own, with_true_psf(seed, n)[star]]))
@@ -215,8 +218,8 @@ def test_pulls_over_many_frames():
         third = np.digitize(table[:, 0], THIRDS[1:3])
         for k in range(3):
             best, own, least = (rms(table[third == k, i : i + 2]) for i in (1, 3, 5))
-            assert best < 1.05 * least, (n, k)
-            assert own == pytest.approx(least, rel=0.05), (n, k)
+            assert best < (1 + tolerance) * least, (n, k)
+            assert own == pytest.approx(least, rel=tolerance), (n, k)
 
 
 def judged(frame, **options):

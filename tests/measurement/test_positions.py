@@ -42,7 +42,7 @@ from legdistort.measurement.profiles.blends import group_stars, members
 
 @pytest.fixture(
     scope="module",
-    params=[pytest.param(4.5, id="fwhm4.5", marks=pytest.mark.slow), pytest.param(2.0, id="fwhm2")],
+    params=[pytest.param(4.5, id="fwhm4.5", marks=pytest.mark.sets), pytest.param(2.0, id="fwhm2")],
 )
 def campaign(request):
     """Two frames of 400 stars of known signal-to-noise ratio, and what was measured."""
@@ -110,10 +110,10 @@ def test_profile_equals_an_independent_rendering(fwhm):
     [
         1.0,
         pytest.param(1.51, marks=pytest.mark.slow),
-        pytest.param(1.91, marks=pytest.mark.slow),
+        pytest.param(1.91, marks=pytest.mark.sets),
         2.0,
-        pytest.param(2.5, marks=pytest.mark.slow),
-        pytest.param(3.01, marks=pytest.mark.slow),
+        pytest.param(2.5, marks=pytest.mark.sets),
+        pytest.param(3.01, marks=pytest.mark.sets),
         3.5,
         pytest.param(6.0, marks=pytest.mark.slow),
     ],
@@ -212,7 +212,7 @@ def test_blends_fitted_together_are_better():
 
 
 @pytest.mark.parametrize(
-    "blends", [pytest.param("alone", marks=pytest.mark.slow), pytest.param("together", marks=pytest.mark.slow)]
+    "blends", [pytest.param("alone", marks=pytest.mark.sets), pytest.param("together", marks=pytest.mark.slow)]
 )
 def test_isolated_stars_of_a_crowded_field_stay_calibrated(blends):
     """One star every 4 FWHM: those without another one in 3 FWHM, detected or not."""

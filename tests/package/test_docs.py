@@ -84,14 +84,32 @@ def test_a_page_states_how_the_folders_that_it_needs_are_made():
             assert f"`{make}`" in prose, f"{page.name}: {make}"
 
 
+#: A line of a shell block that is one command of the package: it needs no process of its own, which imports anew.
+PLAIN = re.compile(r"legdistort [^|&;<>$`\\\n]*")
+
+#: Before the blocks of a page: what runs a line like that, its words as bash reads them.
+SESSION = """
+import subprocess
+from legdistort.cli import main
+
+def run(line):
+    words = subprocess.check_output(["bash", "-euc", "printf '%s\\\\0' " + line], text=True).split("\\0")
+    assert main(words[1:-1]) == 0, line
+
+names = {}
+"""
+
+
 def run_page(page, place):
-    """Run what is on a page, in a folder; the Python of a page is one session."""
-    lines = ["import subprocess", "names = {}"]
+    """Run what is on a page, in a folder; the Python of a page is one session, which runs plain commands too."""
+    lines = [SESSION]
     for language, code in running(page):
-        if language == "sh":
-            lines.append(f"subprocess.run(['bash', '-euc', {code!r}], check=True)")
-        else:
+        if language == "python":
             lines.append(f"exec(compile({code!r}, {page.name!r}, 'exec'), names)")
+        elif all(PLAIN.fullmatch(line) for line in code.splitlines()):
+            lines += [f"run({line!r})" for line in code.splitlines()]
+        else:
+            lines.append(f"subprocess.run(['bash', '-euc', {code!r}], check=True)")
     script = place.with_name(f"{place.name}.script") / "page.py"  # beside nothing that could be imported
     script.parent.mkdir(exist_ok=True)
     script.write_text("\n".join(lines), encoding="utf-8")
@@ -119,8 +137,18 @@ def results(page, done):
     return place
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in reading_order() if running(page)], ids=lambda page: page.stem)
+#: Pages whose commands other pages or tests have, with other options; and the longest, whose nights tests have.
+LIKE_OTHERS = {"catalogue", "command_line", "imager_frames", "many_nights", "swarp_headers"}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=pytest.mark.sets if page.stem in LIKE_OTHERS else pytest.mark.slow, id=page.stem)
+        for page in reading_order()
+        if running(page)
+    ],
+)
 def test_every_block_of_every_page_runs_as_printed(page, common_folder):
     """In a folder with nothing but what the page names, as someone would who opens this page first."""
     done = common_folder / "pages"

@@ -34,8 +34,9 @@ from legdistort.wcs.storage import read_wcs, write_wcs
 
 #: Parts of URLs, of patterns, of home folders, of options, of formulae.
 FOLDERS = ["A#1", "A?x=1", "A;b", "D%41", "a Ä", "-x", "new\nline", "~x", "~", "http:", "file:", "A[1]*", "$A&b"]
-#: Those that each other program has its own trouble with; by default these alone.
+#: Those that each other program has its own trouble with; by default these alone, and two more with the slow tests.
 WORST = {"A#1", "D%41", "new\nline", "~", "http:", "A[1]*"}
+SLOW = {"A?x=1", "-x"}
 #: Exposures named after files; and so their WCS files and copies.
 NAMES = ("A#1", "A?x=1;b", "D%41", "-ä ~b", "~$_$", "http:")
 SHAPE = (40, 50)
@@ -59,7 +60,11 @@ def solution():
     return solve(ld.Matches.from_table(table, shape=SHAPE, poses=poses, sky=sky), degree=1, prior=prior)
 
 
-@pytest.fixture(params=[pytest.param(name, marks=[pytest.mark.slow] * (name not in WORST)) for name in FOLDERS])
+def folder(name):
+    return pytest.param(name, marks=[] if name in WORST else pytest.mark.slow if name in SLOW else pytest.mark.sets)
+
+
+@pytest.fixture(params=map(folder, FOLDERS))
 def place(request, tmp_path, monkeypatch):
     """A folder of such a name, relative to where one works; its neighbours are what is taken for it at the worst."""
     monkeypatch.chdir(tmp_path)
@@ -102,7 +107,7 @@ def mosaic():
     )
 
 
-@pytest.mark.parametrize("stem", [pytest.param("s", marks=pytest.mark.slow), "A#1?x;y%41"])
+@pytest.mark.parametrize("stem", [pytest.param("s", marks=pytest.mark.sets), "A#1?x;y%41"])
 def test_solutions_priors_and_wcs(solution, place, alone, stem):
     solution.write(place / f"{stem}.asdf")
     again = Solution.read(place / f"{stem}.asdf")
@@ -120,7 +125,7 @@ def test_solutions_priors_and_wcs(solution, place, alone, stem):
     alone(f"{stem}.asdf", f"{stem}.prior.asdf", f"{stem}.wcs.asdf")
 
 
-@pytest.mark.parametrize("stem", [pytest.param("m", marks=pytest.mark.slow), "A#1?x;y%41"])
+@pytest.mark.parametrize("stem", [pytest.param("m", marks=pytest.mark.sets), "A#1?x;y%41"])
 def test_mosaics(place, alone, stem):
     endings = (".fits", ".fits.gz", ".fits.bz2", ".asdf")
     for ending in endings:
@@ -134,7 +139,7 @@ def test_mosaics(place, alone, stem):
     alone(*(stem + ending for ending in endings))
 
 
-@pytest.mark.parametrize("stem", [pytest.param("t", marks=pytest.mark.slow), "A#1?x;y%41"])
+@pytest.mark.parametrize("stem", [pytest.param("t", marks=pytest.mark.sets), "A#1?x;y%41"])
 def test_tables(solution, place, alone, stem):
     endings = (".ecsv", ".fits", ".vot", ".xml", ".csv")
     for ending in endings:

@@ -20,16 +20,16 @@ def test_values_without_sense(kind, inputs):
     assert not fuzz_kinds.fuzz_kind(kind, range(inputs))
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("part", [pytest.param(4, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.sets)])
 @pytest.mark.parametrize("kind", fuzz_kinds.KINDS)
-def test_many_values_without_sense(kind):
-    assert not fuzz_kinds.fuzz_kind(kind, range(30 if kind == "folders" else 100))
+def test_many_values_without_sense(kind, part):
+    assert not fuzz_kinds.fuzz_kind(kind, range((30 if kind == "folders" else 100) // part))
 
 
-@pytest.mark.slow
-def test_two_thousand_inputs():
-    counts, faults = fuzz.fuzz(range(2000))
-    assert counts.total() == 2000
+@pytest.mark.parametrize("n", [pytest.param(500, marks=pytest.mark.slow), pytest.param(2000, marks=pytest.mark.sets)])
+def test_many_inputs(n):
+    counts, faults = fuzz.fuzz(range(n))
+    assert counts.total() == n
     assert counts.keys() == fuzz.READERS.keys()
     assert not faults
 

@@ -514,11 +514,11 @@ def assert_complete(function, rows, *subjects):
 
 
 def crossed(pairs, every):
-    """Pairs of options and settings; most of each option, each time others, are slow or sets."""
+    """Pairs of options and settings; most of each option, each time others, are sets, and some of these slow."""
     return [
         pytest.param(
             *pair,
-            marks=[] if k % every == 0 else pytest.mark.slow if k % every == 1 else pytest.mark.sets,
+            marks=[] if k % every == 0 else pytest.mark.slow if k % (3 * every) == 1 else pytest.mark.sets,
             id="-".join(map(str, pair)),
         )
         for k, pair in enumerate(pairs)

@@ -142,8 +142,9 @@ def test_simulation_2(usual):
     assert np.all(np.abs(straight[:, [0, 2]] / straight[:, [0, 2]].mean(axis=0) - 1) < WIDE * 0.1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("n", [2, 10, 50, 100])
+@pytest.mark.parametrize(
+    "n", [pytest.param(n, marks=pytest.mark.slow if n in (2, 50) else pytest.mark.sets) for n in (2, 10, 50, 100)]
+)
 def test_simulation_3(paper, n):
     found = paper("simulations").propagate(n=12, n_exposures=n, n_grid=20)
     slope, error = found.slope(0)
@@ -151,8 +152,10 @@ def test_simulation_3(paper, n):
     assert abs(slope * np.sqrt(n) - 1) < WIDE * error * np.sqrt(n) + 0.03  # b = sigma / sqrt(n_im) to within 3 %
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("n", "printed"), [(100, "1.0"), (200, "1.0")])
+@pytest.mark.parametrize(
+    ("n", "printed"),
+    [pytest.param(100, "1.0", marks=pytest.mark.slow), pytest.param(200, "1.0", marks=pytest.mark.sets)],
+)
 def test_simulation_4(paper, usual, n, printed):
     found = paper("simulations").propagate(n=12, n_stars=n, n_grid=50)
     assert_published(found.slope(2), printed)
@@ -189,7 +192,7 @@ def test_starting_point(paper):
         assert other[1] == pytest.approx(zero[1], rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.sets
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.LegdistortWarning")
 def test_twin_of_the_gems_data(paper, tmp_path):
     """The sizes drawn for 11 exposures are known to 15 %, the mean over n stars to std / sqrt(n)."""

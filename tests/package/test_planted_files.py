@@ -294,8 +294,13 @@ def everything(folder):
     return {path.relative_to(folder).as_posix(): path.lstat().st_mtime_ns for path in paths}
 
 
-@pytest.mark.parametrize("keep", [pytest.param(False, marks=pytest.mark.slow), True])
-@pytest.mark.parametrize(*FIRST)
+@pytest.mark.parametrize(
+    ("attack", "keep"),
+    [
+        *((attack, True) for attack in ATTACKS),
+        *(pytest.param(a, False, marks=pytest.mark.sets if k % 3 else pytest.mark.slow) for k, a in enumerate(ATTACKS)),
+    ],
+)
 def test_writers_change_the_folder_alone(around, attack, keep):
     ATTACKS[attack](around)
     got = around / "got"
@@ -339,9 +344,9 @@ def test_frames_of_the_demonstration(around, monkeypatch):
 
 
 def pairs():
-    """Every attack with a third of the commands in turn, so that every command meets many; one in four is no set."""
+    """Every attack with a third of the commands in turn, so that every command meets many; one in ten is no set."""
     met = [(attack, command) for i, attack in enumerate(ATTACKS) for command in list(COMMANDS)[i % 3 :: 3]]
-    return [pytest.param(*each, marks=pytest.mark.sets if k % 4 else pytest.mark.slow) for k, each in enumerate(met)]
+    return [pytest.param(*each, marks=pytest.mark.sets if k % 10 else pytest.mark.slow) for k, each in enumerate(met)]
 
 
 @pytest.mark.usefixtures("undrawn")

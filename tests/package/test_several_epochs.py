@@ -138,7 +138,7 @@ def test_a_position_is_carried_along_the_path_of_its_star(moving):
 
 
 @pytest.mark.parametrize(
-    "kind", [pytest.param("proper", marks=pytest.mark.slow), pytest.param("parallax", marks=pytest.mark.slow)]
+    "kind", [pytest.param("proper", marks=pytest.mark.sets), pytest.param("parallax", marks=pytest.mark.slow)]
 )
 def test_errors_of_positions_carried_on_are_calibrated(kind):
     """Fresh measurements in one exposure, carried on by twenty years, after which errors of rates are most of all."""

@@ -62,8 +62,8 @@ def whole(out):
     ("locale", "name"),
     [
         pytest.param("C", "with spaces, ünï ☆ 解", marks=pytest.mark.slow),
-        pytest.param("POSIX", "with spaces", marks=pytest.mark.slow),
-        pytest.param("C.UTF-8", "plain", marks=pytest.mark.slow),
+        pytest.param("POSIX", "with spaces", marks=pytest.mark.sets),
+        pytest.param("C.UTF-8", "plain", marks=pytest.mark.sets),
     ],
 )
 def test_locale_c_without_a_home(table, tmp_path, locale, name):
@@ -116,8 +116,9 @@ sys.exit(f"{package} can be written")
 """
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("compiled_from", [10**9, 1])
+@pytest.mark.parametrize(
+    "compiled_from", [pytest.param(10**9, marks=pytest.mark.sets), pytest.param(1, marks=pytest.mark.slow)]
+)
 def test_a_package_that_cannot_be_written(table, tmp_path, read_only, compiled_from):
     """Nor is there a home: compiled loops are made without a place to keep them."""
     bare = {

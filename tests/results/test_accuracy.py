@@ -103,15 +103,18 @@ def test_scatter_of_new_positions_is_the_one_expected(runs, make):
     assert_agrees(pairs, slack=0.05)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "slack"),
     [
-        (lambda seed: paper(seed, zero_mean=False), 0.0),
-        (lambda seed: paper(seed, zero_mean=False, dither=200.0), 0.1),
+        pytest.param(lambda seed: paper(seed, zero_mean=False), 0.0, marks=pytest.mark.slow),
+        pytest.param(lambda seed: paper(seed, zero_mean=False, dither=200.0), 0.1, marks=pytest.mark.sets),
         # the weights of the gauge come from the same few exposures as the scatter that the error is made of
-        (lambda seed: paper(seed, zero_mean=False, dither=200.0, rotations=7.0 * np.arange(10)), 0.4),
-        (lambda seed: simulate_gsaoi_matches(seed=seed), 0.2),
+        pytest.param(
+            lambda seed: paper(seed, zero_mean=False, dither=200.0, rotations=7.0 * np.arange(10)),
+            0.4,
+            marks=pytest.mark.sets,
+        ),
+        pytest.param(lambda seed: simulate_gsaoi_matches(seed=seed), 0.2, marks=pytest.mark.slow),
     ],
 )
 def test_absolute_bias_is_the_one_expected(make, slack):

@@ -251,7 +251,7 @@ def assert_survives(solution, remake):
     "remake",
     [
         lambda s: pickle.loads(pickle.dumps(s)),
-        pytest.param(copy.copy, marks=pytest.mark.slow),
+        pytest.param(copy.copy, marks=pytest.mark.sets),
         pytest.param(copy.deepcopy, marks=pytest.mark.slow),
     ],
 )
@@ -282,15 +282,15 @@ def test_names_are_printed_whole():
 
 @pytest.mark.slow
 def test_size_of_a_pickle():
-    """Of 24,000 positions in 60 exposures; equations stay behind, and what was made from the solution."""
-    matches = simulate_matches(n_exposures=60, n_stars=400, degree=1, seed=1).matches
+    """Of 12,000 positions in 30 exposures; equations stay behind, and what was made from the solution."""
+    matches = simulate_matches(n_exposures=30, n_stars=400, degree=1, seed=1).matches
     solution = solve(matches, degree=1, clip=None)
-    assert len(solution.residuals) > 23000
+    assert len(solution.residuals) > 11500
     size = 2 * basis.n_modes(3)
-    covariances = replace(plain_covariances(solution.estimate), coefficients=np.zeros((60 * size, 60 * size)))
+    covariances = replace(plain_covariances(solution.estimate), coefficients=np.zeros((30 * size, 30 * size)))
     known = {"uncertainty": covariances, "checked": solution.checks}  # as degree 3 has them
     large = replace(solution, estimate=replace(solution.estimate, **known))
-    assert len(pickle.dumps(large)) <= 16e6
+    assert len(pickle.dumps(large)) <= 4.6e6
     before = len(pickle.dumps(solution))
     _ = solution.stars, solution.checks, solution["exp00"].wcs, solution["exp01"].residuals
     assert len(pickle.dumps(solution)) == pytest.approx(before, rel=0.01)

@@ -420,13 +420,14 @@ def test_nights_side_by_side_give_the_same_bits(client, tmp_path):
     assert len({future.result().solution.chi2 for future in futures[:2]}) == 2
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("after", [0.0, 1.5])
+@pytest.mark.parametrize(
+    "after", [pytest.param(0.0, marks=pytest.mark.sets), pytest.param(1.5, marks=pytest.mark.slow)]
+)
 def test_nights_are_added_alike_by_a_cluster_that_loses_a_worker(tmp_path, after):
     """Whether it is killed before or while it works on them: what nights say is added, and is the same to rounding."""
     distributed, paths = pytest.importorskip("distributed"), []
     static = field(np.random.default_rng(5), 1.5)
-    for i in range(8):
+    for i in range(5):
         table = rolled_night(
             i, static + field(np.random.default_rng(10 + i), 0.02), n_stars=70, exposures=6, year=2015 + i
         )
@@ -585,7 +586,7 @@ class TestMosaicInBlocks:
         assert not any(tmp_path.iterdir())
 
     @pytest.mark.parametrize(
-        "method", [pytest.param("mean", marks=pytest.mark.slow), pytest.param("clipped", marks=pytest.mark.slow)]
+        "method", [pytest.param("mean", marks=pytest.mark.sets), pytest.param("clipped", marks=pytest.mark.slow)]
     )
     def test_drizzle_in_processes_gives_the_same_bits(self, monkeypatch, method):
         pytest.importorskip("drizzle")
@@ -595,14 +596,14 @@ class TestMosaicInBlocks:
         one = ld.coadd(exposures, solution, workers=1, **settings)
         assert_same(ld.coadd(exposures, solution, workers=2, **settings), one)
 
-    @pytest.mark.slow
+    @pytest.mark.parametrize("n", [pytest.param(12, marks=pytest.mark.slow), pytest.param(60, marks=pytest.mark.sets)])
     @COMPILED
-    def test_sixty_times_the_same(self, monkeypatch, compiled_from):
+    def test_sixty_times_the_same(self, monkeypatch, compiled_from, n):
         solution, exposures = night(2)
         monkeypatch.setattr(engines, "COMPILED_FROM", compiled_from)
         monkeypatch.setattr(block_stack, "_SAMPLES", 1 << 15)
         one = ld.coadd(exposures, solution, workers=1)
-        for _ in range(60):
+        for _ in range(n):
             assert_same(ld.coadd(exposures, solution, workers=2), one)
 
     def test_files_give_the_same_as_memory(self, tmp_path):
@@ -706,24 +707,26 @@ stacks.SHAPE = (2048, 2048)
 import legdistort as ld
 
 if __name__ == "__main__":
-    solution, *_ = stacks.scene(40, rolls=[0.01 * i for i in range(40)], sky=None)
+    solution, *_ = stacks.scene({n}, rolls=[0.01 * i for i in range({n})], sky=None)
     exposures = ld.open_exposures({folder!r} + "/*.fits")
     mosaic = ld.coadd(exposures, solution, method="clipped", workers=2, scratch={folder!r})
     mosaic.write({folder!r} + "/mosaic.fits")
-    assert mosaic.footprint.max() == 40
+    assert mosaic.footprint.max() == {n}
     print(sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 2**20)
 """
 
 
-@pytest.mark.slow
-def test_many_frames_stay_under_two_gigabytes(tmp_path):
-    """As numbers of double precision their pixels alone would be 1.3 GB, and with variances and weights 4."""
+@pytest.mark.parametrize(
+    ("n", "limit"), [pytest.param(16, 1.3, marks=pytest.mark.slow), pytest.param(40, 2.0, marks=pytest.mark.sets)]
+)
+def test_many_frames_stay_under_two_gigabytes(tmp_path, n, limit):
+    """As numbers of double precision the pixels of 40 alone would be 1.3 GB, and with variances and weights 4."""
     image = np.random.default_rng(1).normal(1000, 20, (2048, 2048)).astype(np.float32)
     fits.writeto(tmp_path / "frame0.fits", image)
-    for i in range(1, 40):
+    for i in range(1, n):
         (tmp_path / f"frame{i}.fits").symlink_to(tmp_path / "frame0.fits")
     script = tmp_path / "script.py"
-    script.write_text(MEMORY.format(tests=str(Path(__file__).parents[1]), folder=str(tmp_path)))
+    script.write_text(MEMORY.format(tests=str(Path(__file__).parents[1]), folder=str(tmp_path), n=n))
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert float(done.stdout) < 2
+    assert float(done.stdout) < limit

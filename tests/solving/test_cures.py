@@ -1,5 +1,6 @@
 """Cures are applied as named: the check passes, with the figure promised. Sets of `dense_model`, numpy alone."""
 
+import itertools
 import re
 import warnings
 
@@ -49,9 +50,16 @@ def test_the_cure_that_is_named_cures(kind):
     assert_cured(kind, 0)
 
 
-@pytest.mark.parametrize("kind", flawed_sets.CURES)
+#: Of the kinds that the first set leaves out.
+SLOW = ("double", 1), ("floor", 1)
+
+
 @pytest.mark.parametrize(
-    "seed", [pytest.param(seed, marks=pytest.mark.slow if seed < 3 else pytest.mark.sets) for seed in range(1, 11)]
+    ("kind", "seed"),
+    [
+        pytest.param(*case, marks=pytest.mark.slow if case in SLOW else pytest.mark.sets)
+        for case in itertools.product(flawed_sets.CURES, range(1, 11))
+    ],
 )
 def test_the_cure_that_is_named_cures_other_sets(kind, seed):
     assert_cured(kind, seed)
@@ -77,7 +85,7 @@ def test_what_a_degree_leaves_of_turbulence_is_foretold():
     "seed",
     [pytest.param(seed, marks=pytest.mark.slow if seed == 200 else pytest.mark.sets) for seed in (200, 201, 202, 204)],
 )
-@pytest.mark.parametrize("size", [0.8, 3.0])
+@pytest.mark.parametrize("size", [pytest.param(0.8, marks=pytest.mark.sets), 3.0])
 def test_what_a_degree_leaves_of_turbulence_is_foretold_in_other_sets(size, seed):
     about = assert_foretold(size, seed)
     assert about or size < 3
@@ -147,9 +155,12 @@ def test_of_three_cures_of_a_camera_the_right_one_is_named():
     assert_camera_is_cured("layout", 0, n=5, n_stars=100)
 
 
-@pytest.mark.parametrize("kind", four_detectors.CURES)
 @pytest.mark.parametrize(
-    "seed", [pytest.param(seed, marks=pytest.mark.slow if seed == 1 else pytest.mark.sets) for seed in range(6)]
+    ("kind", "seed"),
+    [
+        pytest.param(*case, marks=pytest.mark.slow if case in (("static", 1), ("departures", 1)) else pytest.mark.sets)
+        for case in itertools.product(four_detectors.CURES, range(6))
+    ],
 )
 def test_of_three_cures_of_a_camera_the_right_one_is_named_in_other_sets(kind, seed):
     assert_camera_is_cured(kind, seed)

@@ -528,10 +528,10 @@ def test_expected_scatter_takes_an_error_for_each_position():
 @pytest.mark.parametrize(
     "by_degree",
     [
-        pytest.param((0.5,) * 4, marks=pytest.mark.slow),
+        pytest.param((0.5,) * 4, marks=pytest.mark.sets),
         pytest.param((0.5, 0.3, 0.1, 0.05), marks=pytest.mark.slow),
-        pytest.param((0.5, 0.2), marks=pytest.mark.slow),
-        pytest.param((0.0,), marks=pytest.mark.slow),
+        pytest.param((0.5, 0.2), marks=pytest.mark.sets),
+        pytest.param((0.0,), marks=pytest.mark.sets),
     ],
 )
 def test_the_choice_costs_little(by_degree):

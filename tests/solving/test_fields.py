@@ -92,7 +92,7 @@ def test_two_fields_once(name):
     assert abs(chi2 - 1) < 0.12
 
 
-@pytest.mark.parametrize("n_sets", [pytest.param(8, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.sets)])
+@pytest.mark.parametrize("n_sets", [pytest.param(4, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.sets)])
 @pytest.mark.parametrize("name", SETTINGS)
 def test_two_fields_are_at_the_bound_and_calibrated(name, n_sets):
     wide = np.sqrt(20 / n_sets)  # by the standard errors

@@ -48,7 +48,7 @@ def test_an_effect_of_the_size_of_the_errors_is_named(effect):
         assert chi2.cure == next(each.cure for each in EFFECTS if each.name == effect)
 
 
-@pytest.mark.parametrize("n_sets", [pytest.param(8, marks=pytest.mark.slow), pytest.param(30, marks=pytest.mark.sets)])
+@pytest.mark.parametrize("n_sets", [pytest.param(3, marks=pytest.mark.slow), pytest.param(30, marks=pytest.mark.sets)])
 @each_effect
 def test_effects_are_named_in_nine_of_ten_sets(effect, n_sets):
     found = [named(solved(known_displacements.displaced(effect, 100 + seed)[0])) for seed in range(n_sets)]
@@ -58,7 +58,7 @@ def test_effects_are_named_in_nine_of_ten_sets(effect, n_sets):
 
 
 @pytest.mark.parametrize(
-    "n_sets", [pytest.param(30, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.sets)]
+    "n_sets", [pytest.param(10, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.sets)]
 )
 def test_nothing_is_named_where_nothing_is(n_sets):
     """Not even where errors are wrong, or exposures noisier than the others."""

@@ -83,23 +83,25 @@ SELF = {"static": "fit", "exposure_degree": 0}
 @pytest.mark.parametrize(
     ("n_sets", "errors", "how"),
     [
-        pytest.param(40, (0.0, 0.0, 0.0), {"prior": NOTHING}, marks=pytest.mark.slow),
-        pytest.param(40, (0.1, 0.01, 1e-4), {"prior": NOTHING}, marks=pytest.mark.slow),
-        pytest.param(60, (0.0, 0.0, 0.0), {"static": 1.0}, marks=pytest.mark.slow),
+        pytest.param(40, (0.0, 0.0, 0.0), {"prior": NOTHING}, marks=pytest.mark.sets),
+        pytest.param(15, (0.1, 0.01, 1e-4), {"prior": NOTHING}, marks=pytest.mark.slow),
+        pytest.param(40, (0.1, 0.01, 1e-4), {"prior": NOTHING}, marks=pytest.mark.sets),
+        pytest.param(15, (0.0, 0.0, 0.0), {"static": 1.0}, marks=pytest.mark.slow),
+        pytest.param(60, (0.0, 0.0, 0.0), {"static": 1.0}, marks=pytest.mark.sets),
         pytest.param(60, (0.1, 0.01, 1e-4), {"static": 1.0}, marks=pytest.mark.sets),
         pytest.param(60, (0.1, 0.0, 1e-4), {"static": 1.0, "roll": 40.0}, marks=pytest.mark.sets),
         pytest.param(
             60,
             (0.02, 0.01, 1e-5),
             {"static": 1.0, "single": 0.0, "roll": 40.0, "options": SELF},
-            marks=pytest.mark.slow,
+            marks=pytest.mark.sets,
         ),
-        pytest.param(60, (5.0, 0.5, 1e-3), {"prior": NOTHING, "dither": 20.0}, marks=pytest.mark.slow),
+        pytest.param(60, (5.0, 0.5, 1e-3), {"prior": NOTHING, "dither": 20.0}, marks=pytest.mark.sets),
     ],
 )
 def test_absolute_errors_are_calibrated(n_sets, errors, how):
     """Nothing is taken off: shift, rotation and scale are those of the poses, as well as these are known."""
-    assert square_pull(n_sets, errors, **how) == pytest.approx(1, abs=0.2)
+    assert square_pull(n_sets, errors, **how) == pytest.approx(1, abs=0.2 * max(1, np.sqrt(40 / n_sets)))
 
 
 def test_infinite_is_today():

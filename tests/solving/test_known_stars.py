@@ -41,7 +41,7 @@ def after_pointing(base, stars, positions, true):
     ("n_sets", "setting", "tolerance"),
     [
         pytest.param(6, {}, 0.5, marks=pytest.mark.slow),
-        pytest.param(40, {}, 0.2, marks=pytest.mark.slow),
+        pytest.param(40, {}, 0.2, marks=pytest.mark.sets),
         pytest.param(40, {"dynamic": 0.1}, 0.2, marks=pytest.mark.sets),
     ],
 )

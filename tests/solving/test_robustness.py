@@ -244,7 +244,7 @@ def test_no_more_is_left_out_than_leaves_something_to_judge_by():
 
 
 @pytest.mark.parametrize(
-    "n_sets", [pytest.param(60, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.sets)]
+    "n_sets", [pytest.param(24, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.sets)]
 )
 def test_clean_sets_lose_nothing(n_sets):
     """Half of them of three exposures; and errors stated 1.5 times too small."""
@@ -538,7 +538,7 @@ def test_an_exposure_that_bends_more_than_others_does_not_contradict_them():
     ("share", "size", "serves"),
     [
         (0.01, 0.3, True),
-        pytest.param(0.02, 0.3, True, marks=pytest.mark.slow),
+        pytest.param(0.02, 0.3, True, marks=pytest.mark.sets),
         pytest.param(0.04, 0.2, True, marks=pytest.mark.slow),
         pytest.param(0.3, 20.0, False, marks=pytest.mark.slow),
     ],

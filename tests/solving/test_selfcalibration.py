@@ -143,12 +143,19 @@ def test_recovers_a_static_distortion():
     assert map_error(solution, sim.truth.static) == pytest.approx(expected_map_error(solution), rel=0.5)
 
 
-@pytest.mark.parametrize("own", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.sets)])
-def test_a_gsaoi_map_is_recovered_at_the_bound(own):
-    """The real map of degree 5, HST-like rolls: rms error up to an affine map, against the reported one, 40 seeds."""
+@pytest.mark.parametrize(
+    ("own", "n_sets"),
+    [
+        pytest.param(0, 10, marks=pytest.mark.slow),
+        pytest.param(0, 40, marks=pytest.mark.sets),
+        pytest.param(1, 40, marks=pytest.mark.sets),
+    ],
+)
+def test_a_gsaoi_map_is_recovered_at_the_bound(own, n_sets):
+    """The real map of degree 5, HST-like rolls: rms error up to an affine map, against the reported one."""
     static = Prior.from_model(gsaoi_static(2), shape=SHAPE, direction="detector_to_reference", degree=5).mean
     found, expected = [], []
-    for seed in range(40):
+    for seed in range(n_sets):
         sim = camera(seed, static=static, rolls=33.0)
         solution = solve(sim.matches, degree=5, static="fit", exposure_degree=own)
         found.append(map_error(solution, static) ** 2)
@@ -156,7 +163,7 @@ def test_a_gsaoi_map_is_recovered_at_the_bound(own):
     ratio = np.sqrt(np.mean(found) / np.mean(expected))
     print(f"exposure_degree {own}: map error over reported {ratio:.3f}")  # quoted in docs/self_calibration.md
     # with affine maps of their own the common shear is known less well, which bends the map a little, to second order
-    assert ratio == pytest.approx(1, abs=0.15 if own else 0.1)
+    assert ratio == pytest.approx(1, abs=(0.15 if own else 0.1) * np.sqrt(40 / n_sets))
 
 
 def test_every_detector_has_its_own():

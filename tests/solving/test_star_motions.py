@@ -131,7 +131,7 @@ def test_the_exposures_may_come_in_any_order():
     )
 
 
-@pytest.mark.parametrize(("n", "accuracy"), [(8, 0.1), pytest.param(60, 0.05, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("n", "accuracy"), [(8, 0.1), pytest.param(60, 0.05, marks=pytest.mark.sets)])
 def test_relative_errors_are_calibrated(n, accuracy):
     """Squared pulls after a cubic map of all stars, over n realisations."""
     pulls = {name: [] for name in ("x", "vx")}
@@ -218,7 +218,7 @@ def test_auto_decides_by_evidence(size, chosen):
 
 
 @pytest.mark.parametrize(
-    "n_sets", [pytest.param(30, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.sets)]
+    "n_sets", [pytest.param(10, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.sets)]
 )
 def test_auto_decides_by_evidence_in_many_sets(n_sets):
     wrong, missed = 0, 0
@@ -597,7 +597,7 @@ def bound(sim, solution):
     ("kind", "epochs", "realisations"),
     [
         pytest.param("proper", THREE, 12, marks=pytest.mark.sets),
-        pytest.param("parallax", FIVE, 4, marks=pytest.mark.slow),
+        pytest.param("parallax", FIVE, 2, marks=pytest.mark.slow),
         pytest.param("parallax", FIVE, 12, marks=pytest.mark.sets),
     ],
 )

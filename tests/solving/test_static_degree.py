@@ -90,9 +90,8 @@ def test_the_same_of_a_camera_of_degree_5(seed):
     assert_named(static_set(seed, 2), 3, 5)
 
 
-@pytest.mark.parametrize(
-    "seed", [pytest.param(seed, marks=pytest.mark.slow if seed == 5 else pytest.mark.sets) for seed in range(5, 12)]
-)
+@pytest.mark.sets
+@pytest.mark.parametrize("seed", range(5, 12))
 def test_the_same_of_other_sets(seed):
     assert_named(static_set(seed, 1), 3, 5)
 

@@ -105,8 +105,8 @@ SETTINGS = {
 
 #: One of each kind of estimation.
 QUICK = {"plain", "exact prior", "cauchy", "clipped", "motions", "reference", "static fitted", "scale"}
-#: What a solution takes ten seconds with: its order is looked at.
-LONG = {"degree chosen"}
+#: Beside these, of those that are much like another.
+SLOW = {"evidence", "large distortions"}
 
 
 def found(solution, names=None):
@@ -165,18 +165,16 @@ def solved():
 
 
 def cases(*without):
-    """Settings and seeds; those beyond the first are sets, and slow is what is much like another."""
+    """Settings and seeds; those beyond the first are sets, and so is most of what is much like another."""
     made = [(setting, seed) for setting in SETTINGS if setting not in without for seed in range(2)]
-    others = [setting in LONG or seed > 0 for setting, seed in made]
+    others = [seed > 0 or setting not in QUICK | SLOW for setting, seed in made]
     return [
         pytest.param(*each, marks=pytest.mark.sets if other else [pytest.mark.slow] * (each[0] not in QUICK))
         for each, other in zip(made, others, strict=True)
     ]
 
 
-@pytest.mark.parametrize(
-    ("setting", "seed"), [*cases(*LONG), *(pytest.param(each, 0, marks=pytest.mark.slow) for each in LONG)]
-)
+@pytest.mark.parametrize(("setting", "seed"), cases())
 def test_order_and_names(setting, seed, solved):
     one, first = solved(setting, seed)
     order = np.random.default_rng(0).permutation(len(one.columns["x"]))

@@ -120,11 +120,11 @@ def wcs_in(path, number=1):
 @pytest.mark.parametrize(
     ("degree", "peak", "place"),
     [
-        pytest.param(3, 5, {}, marks=pytest.mark.slow),
+        pytest.param(3, 5, {}, marks=pytest.mark.sets),
         pytest.param(3, 20, {"lat": 89.9, "lon": 123.0}, marks=pytest.mark.slow),
-        pytest.param(3, 100, {"lon": 0.0}, marks=pytest.mark.slow),
+        pytest.param(3, 100, {"lon": 0.0}, marks=pytest.mark.sets),
         pytest.param(5, 5, {"lat": -89.9, "parity": 1}, marks=pytest.mark.slow),
-        pytest.param(5, 20, {"lon": 0.0, "turn": 170.0}, marks=pytest.mark.slow),
+        pytest.param(5, 20, {"lon": 0.0, "turn": 170.0}, marks=pytest.mark.sets),
         pytest.param(5, 100, {"lat": -60.0, "parity": 1}, marks=pytest.mark.slow),
     ],
 )
