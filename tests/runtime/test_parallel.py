@@ -552,7 +552,7 @@ class TestMosaicInBlocks:
             pytest.param({"order": 5, "method": "median"}, marks=pytest.mark.slow),
             pytest.param({"algorithm": "adaptive"}, marks=pytest.mark.slow),
             {"algorithm": "drizzle"},
-            pytest.param({"algorithm": "exact"}, marks=pytest.mark.slow),
+            pytest.param({"algorithm": "exact"}, marks=pytest.mark.sets),
         ],
         ids=lambda s: " ".join(map(str, s.values())),
     )
