@@ -246,7 +246,7 @@ def run(
         with timed(timings, "read"):
             exposures, bad = _open_frames(paths, min_exposures, stop_at_bad, progress, reference is not None, **reading)
             solving = _known_of(exposures, solving, prior, reading["camera"])
-            stated_numbers(exposures, matching.keywords)  # refuses what no header states
+            stated_numbers({whole_name(e): e.header for e in exposures}, matching.keywords)  # refuses what none states
         with timed(timings, "measure"):
             detections, psfs = _detected(exposures, before, measuring, share)
         with timed(timings, "match"):

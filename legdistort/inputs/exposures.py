@@ -197,12 +197,13 @@ def observed(exposures):
     return {what: text for what, text in found.items() if text}
 
 
-def stated_numbers(exposures, keywords):
+def stated_numbers(headers, keywords):
     """What headers state under keywords, ``{keyword: {exposure: number}}``; NaN where one does not, as the log says.
 
     Parameters
     ----------
-    exposures : iterable of Exposure or ExposureFile
+    headers : dict
+        ``{exposure: `~astropy.io.fits.Header`}``.
     keywords : sequence of str or None
 
     Raises
@@ -210,7 +211,7 @@ def stated_numbers(exposures, keywords):
     InputError
         For a keyword that none of them states as a number, with those like it.
     """
-    headers, out = {whole_name(exposure): exposure.header for exposure in exposures}, {}
+    out = {}
     for keyword in keywords or ():
         stated = {name: as_number(header.get(keyword)) for name, header in headers.items()}
         lacking = [name for name, value in stated.items() if value is None]

@@ -303,7 +303,8 @@ def _add_numbers(table, named, keywords):
             f"keywords: {lacking[0]} is to be read from headers, and there are no frames: give them, exposures= "
             "(--wcs FRAME ...), or a column of that name"
         )
-    for keyword, numbers in stated_numbers(named.values(), lacking).items():
+    headers = {name: exposure.header for name, exposure in named.items()}
+    for keyword, numbers in stated_numbers(headers, lacking).items():
         table[keyword] = [numbers.get(name, np.nan) for name in table["exposure"]]
 
 

@@ -4,6 +4,7 @@ import json
 import re
 
 import asdf
+import header_layouts
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -241,6 +242,14 @@ def test_one_night_tells_by_its_exposures_alone():
 
 
 # --- from headers to the table of matches -------------------------------------------------------------------------
+
+
+def test_exposures_of_several_detectors_have_their_number():
+    night = header_layouts.Night(1, n=3, n_stars=250)
+    for image in night.exposures:
+        image.header[KEY] = 10.0 * int(image.exposure[1:])
+    table = ld.match(night.table, exposures=night.exposures, keywords=[KEY], min_exposures=2).table
+    assert {(name, number) for name, number in table["exposure", KEY]} == {("e0", 0.0), ("e1", 10.0), ("e2", 20.0)}
 
 
 def test_keywords_of_headers_become_columns(caplog):
