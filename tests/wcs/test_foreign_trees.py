@@ -187,7 +187,7 @@ def test_a_model_that_cannot_be_refined_is_named(night, tmp_path):
 
 @pytest.mark.slow
 def test_catalogues_with_the_wcs_of_their_images(night, tmp_path, capsys):
-    """Lists as `photutils` writes them beside the images of a pipeline: sky, shape and time are those of the images."""
+    """Lists as the JWST pipeline writes them beside its images: sky, shape and time are those of the images."""
     from legdistort.cli import main
 
     paths, solution = night
@@ -200,7 +200,8 @@ def test_catalogues_with_the_wcs_of_their_images(night, tmp_path, capsys):
     lists = [str(tmp_path / f"{path.stem}_cat.ecsv") for path in paths]
     words = ["--error", "0.02", "--wcs", *map(str, paths), "--out", str(tmp_path / "matched.ecsv")]
     assert main(["match", *lists, *words]) == 0
-    assert capsys.readouterr().err.count("columns of photutils: x = xcentroid, y = ycentroid") == 1  # of six lists
+    told = "columns of the JWST pipeline: x = xcentroid, y = ycentroid, flux = aper_total_flux"
+    assert capsys.readouterr().err.count(told) == 1  # of six lists
     assert main(["solve", str(tmp_path / "matched.ecsv"), "--degree", "2", "--out", str(tmp_path / "solved")]) == 0
     found = ld.Solution.read(tmp_path / "solved")
     assert found.names == solution.names
