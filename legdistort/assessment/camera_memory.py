@@ -453,8 +453,9 @@ class CombinedNights(ShownAsPrinted):
         lines.append("Normalised Legendre modes, undistorted to detector pixels, shift, rotation and scale taken off:")
         lines += [*self.modes().pformat(max_lines=-1, max_width=-1), *self._said_of_weak()]
         shown = self.table[[name for name in self.table.colnames if name != "odd"]]
-        for name, form in (("date", ".3f"), ("departure", ".4f"), ("chi2", ".1f"), ("p", ".2g"), ("oddness", ".2f")):
-            shown[name].info.format = form
+        forms = {"date": ".3f", "departure": ".4f", "chi2": ".1f", "p": ".2g", "oddness": ".2f", "value": ".6g"}
+        for name in forms.keys() & set(shown.colnames):
+            shown[name].info.format = forms[name]
         return "\n".join([*lines, "", *shown.pformat(max_lines=22, max_width=-1)])
 
 
