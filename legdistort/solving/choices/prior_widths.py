@@ -223,9 +223,8 @@ class Evidence:
         low, high = np.log(bounds)
         own = self.label < n
         square = np.bincount(self.label[own], (self.pull[own] / np.diag(self.curvature)[own]) ** 2, n)
-        unit = square / np.bincount(
-            self.label[own], minlength=n
-        )  # variances of that order: where 0 is left if it has to be
+        count = np.bincount(self.label[own], minlength=n)
+        unit = square / count  # variances of that order: where 0 is left if it has to be
         dropped = np.zeros(n, dtype=bool)
 
         def cost(variance):
