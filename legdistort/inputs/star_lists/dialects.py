@@ -109,11 +109,12 @@ DIALECTS = (
         for flux in ("aper_total_flux", "isophotal_flux")
     ),
     *(
-        Dialect("photutils", {"x": (x,), "y": (y,), "flux": ("segment_flux",), "flux_err": error}, (x, y))
-        for x, y, error in (
-            ("xcentroid", "ycentroid", ("segment_fluxerr",)),
-            ("x_centroid", "y_centroid", ("segment_flux_err", "segment_fluxerr")),
+        Dialect(
+            "photutils",
+            {"x": (x,), "y": (y,), "flux": ("segment_flux",), "flux_err": ("segment_flux_err", "segment_fluxerr")},
+            (x, y),
         )
+        for x, y in (("xcentroid", "ycentroid"), ("x_centroid", "y_centroid"))
     ),
 )
 
