@@ -19,7 +19,7 @@ from legdistort.solving.knowledge.posterior import Posterior, most_likely
 from legdistort.solving.knowledge.reduced_data import ReducedData
 from legdistort.solving.knowledge.static_test import StaticTest, _symmetries, static_tests
 
-RNG = np.random.default_rng(4)
+RNG = np.random.default_rng
 
 
 def solved(data, prior=None, **options):
@@ -36,14 +36,15 @@ def model_of(solution):
 @pytest.fixture(scope="module")
 def linear():
     """Data y = D z + noise on 6 of 9 unknowns, with rows of two sizes and rows of given width on all: dense arrays."""
-    design, noise = RNG.normal(size=(40, 6)), RNG.uniform(0.5, 2, 40)
+    rng = RNG(4)
+    design, noise = rng.normal(size=(40, 6)), rng.uniform(0.5, 2, 40)
     rows = np.zeros((15, 9))
     rows[:6, :6] = np.eye(6)
     rows[np.arange(6), 6 + np.arange(6) % 3] = -1
-    rows[6:12, :6] = RNG.normal(size=(6, 6))
+    rows[6:12, :6] = rng.normal(size=(6, 6))
     rows[12:, 6:] = np.eye(3)
-    value, size = RNG.normal(size=15), np.repeat([0, 1, GIVEN], [6, 6, 3])
-    width, y = np.where(size == GIVEN, 0.7, np.nan), RNG.normal(size=40)
+    value, size = rng.normal(size=15), np.repeat([0, 1, GIVEN], [6, 6, 3])
+    width, y = np.where(size == GIVEN, 0.7, np.nan), rng.normal(size=40)
     weighted = design.T / noise**2
     data = ReducedData(weighted @ design, weighted @ y, float(((y / noise) ** 2).sum()), 40)
     return data, Factor("test", sparse.csr_array(rows), value, width, size), (design, noise, y, rows)
@@ -169,7 +170,7 @@ class TestStatic:
         """However wrong the mean is along a combination of unknown size, and nowhere else."""
         data, truth = dense_model.drawn_set(5, rolls=30.0)
         along = np.zeros((2, 10))
-        along[:, [3, 5, 7]] = RNG.normal(size=(2, 3))
+        along[:, [3, 5, 7]] = RNG(4).normal(size=(2, 3))
         across = np.roll(along, 1, axis=0) * [[1], [-1]]
         covariance = 0.01**2 * np.eye(20) + 500.0**2 * np.outer(along, along)
         right, wrong, off = (
@@ -216,7 +217,7 @@ class TestStatic:
         """Of drawn differences, for a test of any information."""
         information, given = np.diag([4.0, 1.0, 0.25]), np.array([2.0, 1.0, 1.0])
         test = StaticTest(information, np.zeros(3), given, np.zeros((3, 3)), (8, 8), np.eye(3), 1e6)
-        drawn = given + RNG.normal(size=(20_000, 3)) / np.sqrt(np.diag(information))
+        drawn = given + RNG(4).normal(size=(20_000, 3)) / np.sqrt(np.diag(information))
         t = np.einsum("na,ab,nb->n", drawn, information, drawn)
         assert test.power(0.05) == pytest.approx(np.mean(t > stats.chi2.isf(0.025, 3)), abs=0.03)
 
@@ -230,7 +231,8 @@ def test_symmetries_turn_the_field_and_its_vectors(words):
         "turned by 90 degrees": [[0, -1], [1, 0]], "turned by -90 degrees": [[0, 1], [-1, 0]],
         "mirrored across the other diagonal": [[0, -1], [-1, 0]],
     }[words]  # fmt: skip
-    field, points = RNG.normal(size=(2, basis.n_modes(3))), RNG.uniform(-1, 1, (2, 20))
+    rng = RNG(4)
+    field, points = rng.normal(size=(2, basis.n_modes(3))), rng.uniform(-1, 1, (2, 20))
     turned = _symmetries((64, 64))[words](field)
     expected = np.array(r) @ field @ basis.values(3, *(np.array(r).T @ points))
     assert_allclose(turned @ basis.values(3, *points), expected, atol=1e-12)
