@@ -1,10 +1,11 @@
 """How far a night departs from what the others have in common, by how far these scatter: each is left out in turn.
 
-Of the exposures of night n, ``m_n = S + M_n g + B_n + d_n``: their mean coefficients, S the static distortion of the
-detector, g a common map of the reference plane (with motions one that grows with time beside), ``B_n ~ N(0, Lambda)``
-the departure of the night, d_n the mean of departures and errors of its exposures. Lambda, by degree, is that which
-makes the other nights most likely (`most_likely`). S is free, and g but for what differences within nights show of it,
-so that a night that is odd moves nothing of what it is compared with; the rest is compared without it.
+The exposures of night n scatter about ``m_n = S + B_n``: S is the static distortion of the detector, ``B_n ~ N(0,
+Lambda)`` the departure of the night. Lambda, by degree, is that which makes the other nights most likely
+(`most_likely`). S is free, so that a night that is odd moves nothing of what it is compared with; the rest is compared
+without it. What the data say of m_n holds whatever widths the fit had: these are taken out, and stars are eliminated.
+Data say nothing of a common map of a field (with motions one that grows with time beside), so that nights which only
+such a map parts are alike.
 """
 
 from dataclasses import dataclass
@@ -28,15 +29,18 @@ from .odd_ones import beyond_chance, compared, with_others
 ODD = 3.0
 #: Others from which a night can be told odd.
 FEWEST = 2
-#: Nights that are compared with one another, drawn at random where there are more.
-_MOST = 24
+#: Nights and exposures that are compared with one another, drawn at random where there are more: so many at most.
+_MOST, _MOST_EXPOSURES = 24, 60
+#: Nights that are compared with one another however many exposures they have: exposures are drawn then.
+_LEAST = 6
 #: Up to so many nights the scatter of the others is found anew for each; among more a single one does not count.
 _EACH = 12
 _COEFFICIENTS = 500  # from which the static distortion of nights is found
 _FREE = 100.0  # size of what is free [pix]
+_WIDER = 0.99  # probability below which exposures of one night scatter no more than those of others
+_ALIKE = 0.01  # part of the largest expected square of a degree, below which the data say nothing of a mode
 #: Scatter is sought within these factors of the typical error of a mean; less is none, and smaller numbers lose digits.
 _RANGE = 0.1, 1e6
-_MAP = 2.0  # size of a common map, in that of the coefficients: the plane is none that would need larger ones
 _SMALLEST = 1e-5  # pixels: as good as exact
 _KNOWN = 0.3 * np.sqrt(8)  # error of a combination beyond which a direction is not determined [pix]
 
@@ -67,9 +71,12 @@ def found_nights(solution, problem, state, blocks):
     for detector in np.unique(problem.detectors):
         each = np.flatnonzero(problem.detectors == detector)
         owners = rng.permutation(np.unique(night[each]))
-        for part in np.array_split(owners, -(-len(owners) // _MOST)):
+        most = np.clip(_MOST_EXPOSURES * len(owners) // len(each), _LEAST, _MOST)
+        for part in np.array_split(owners, -(-len(owners) // most)):
             some = each[np.isin(night[each], part)]
-            means = _Means.of(solution, problem, blocks, some, np.unique(night[some], return_inverse=True)[1])
+            some = some[drawn(night[some], _MOST_EXPOSURES)]
+            owner = np.unique(night[some], return_inverse=True)[1]
+            means = _Means.of(*part_of(problem, state, some), solution.gauge.all_motion[some], owner)
             for n, test in zip(np.sort(part), means.tests(FALSE_ALARM / len(number)), strict=True):
                 found[n].append(test)
     tests = {n: _together(each) for n, each in found.items()}
@@ -163,48 +170,30 @@ def _together(tests):
 
 @dataclass(frozen=True, eq=False)
 class _Means:
-    """Mean coefficients of nights.
+    """What the data say of what the exposures of nights have in common.
 
     Attributes
     ----------
     values : ndarray, shape (n, K)
-    covariance : ndarray, shape (n, K, K)
-        Of d_n.
-    maps : ndarray, shape (n, K, m)
-        M_n.
+        m_n where the data are linear.
+    data : ReducedData
+        Of steps of these, (n K).
     degrees : ndarray of int, shape (K,)
-    root, seen : ndarray, shapes (m, m) and (m,)
-        ``root g - seen ~ N(0, 1)``: what differences of exposures within nights show of g.
     """
 
     values: np.ndarray
-    covariance: np.ndarray
-    maps: np.ndarray
+    data: ReducedData
     degrees: np.ndarray
-    root: np.ndarray
-    seen: np.ndarray
 
     @classmethod
-    def of(cls, solution, problem, blocks, each, owner):
-        """Those of some exposures of a detector (k,), whose nights are `owner` (k,)."""
-        size, gauge = problem.n_modes, solution.gauge
-        rows, degrees = dynamic_basis(problem.shapes[each[0]], size), dynamic_degrees(size)
-        a = (solution.coefficients - solution.estimate.prior_mean)[each, :, :size].reshape(len(each), -1) @ rows.T
-        noise = np.einsum("ka,iab,lb->ikl", rows, np.linalg.inv(blocks.u[each]), rows)
-        motion = gauge.all_motion[each].reshape(len(each), 2, gauge.n_own, -1)
-        motion = np.pad(motion, ((0, 0), (0, 0), (0, size - gauge.n_own), (0, 0)))
-        maps = np.einsum("ka,iam->ikm", rows, motion.reshape(len(each), 2 * size, -1))
-        mean = np.eye(owner.max() + 1)[:, owner] / np.bincount(owner)[:, None]
-        values, variance = mean @ a, np.diagonal(noise, axis1=1, axis2=2)
-        map_means = np.einsum("ni,ikm->nkm", mean, maps)
-        apart, moved = a - values[owner], maps - map_means[owner]
-        information = np.eye(maps.shape[2]) / (_MAP * max(np.sqrt(np.mean(values**2)), _SMALLEST)) ** 2
-        weight = 1 / (variance + (_within(apart, variance, owner, degrees) * np.bincount(owner)[:, None])[owner])
-        root = np.linalg.cholesky(information + np.einsum("ikm,ik,ikl->ml", moved, weight, moved)).T
-        seen = np.linalg.solve(root.T, np.einsum("ikm,ik,ik->m", moved, weight, apart))
-        scatter = _within(apart - moved @ np.linalg.solve(root, seen), variance, owner, degrees)
-        covariance = np.einsum("ni,ikl->nkl", mean**2, noise) + scatter[:, :, None] * np.eye(len(rows))
-        return cls(values, covariance, map_means, degrees, root, seen)
+    def of(cls, problem, state, motion, owner):
+        """That of a fit (see `ExposureModel.of`) whose exposures are of the nights `owner` (n_exposures,)."""
+        model = ExposureModel.of(problem, state, motion, np.zeros(len(owner), dtype=int))
+        count = np.bincount(owner)
+        values = (np.eye(len(count))[:, owner] / count[:, None]) @ model.departure
+        apart, degrees = model.departure - values[owner], model.degrees
+        scatter = _within(model.data, apart, owner, degrees)
+        return cls(values, _shared(model.data, apart, owner, scatter), degrees)
 
     def tests(self, alarm):
         """The `NightTest` of every night, whose p is odd below an alarm.
@@ -225,33 +214,23 @@ class _Means:
         return [tests[k] if k in tests else self._test(k, odd - {k}, alarm) for k in range(n)]
 
     def _factor(self, out):
-        """What is known of the departures, those of some nights but that they are free, and of S and g."""
+        """What is known of the departures, those of some nights but that they are free, and of S."""
         n, k = self.values.shape
-        m = self.maps.shape[2]
-        static, maps = sparse.kron(np.ones((n, 1)), -np.eye(k)), sparse.csr_array(-self.maps.reshape(n * k, m))
-        own = sparse.hstack([sparse.eye_array(n * k), static, maps], format="csr")
-        free = sparse.block_array(
-            [[sparse.csr_array((k + m, n * k)), sparse.block_diag([np.eye(k), self.root])]]
-        ).tocsr()
+        static = sparse.kron(np.ones((n, 1)), -np.eye(k))
         size = np.where(np.isin(np.arange(n), list(out))[:, None], GIVEN, self.degrees - 1).ravel()
-        own = Factor("departures of nights", own, self.values.ravel(), np.full(n * k, _FREE), size)
-        width, value = np.append(np.full(k, _FREE), np.ones(m)), np.append(np.zeros(k), -self.seen)
-        free = Factor("common", free, value, width, np.full(k + m, GIVEN))
+        rows = sparse.hstack([sparse.eye_array(n * k), static], format="csr")
+        own = Factor("departures of nights", rows, self.values.ravel(), np.full(n * k, _FREE), size)
+        rows = sparse.eye_array(k, (n + 1) * k, k=n * k, format="csr")
+        free = Factor("static distortion", rows, np.zeros(k), np.full(k, _FREE), np.full(k, GIVEN))
         return Factor.joined([own, free])
 
     def _posterior(self, out, sizes=None):
         """Of the nights that are not left out; at given sizes, or those that make them most likely."""
-        n, k = self.values.shape
-        curvature = np.zeros((n, k, n, k))
-        curvature[np.arange(n), :, np.arange(n)] = np.linalg.inv(self.covariance)
-        data, factor = (
-            ReducedData(curvature.reshape(n * k, n * k), np.zeros(n * k), 0.0, n * k),
-            self._factor(out),
-        )
+        data, factor = self.data, self._factor(out)
         if sizes is not None:
             return Posterior(data, factor, sizes)
-        unit = 1 / np.sqrt(np.median(np.diag(data.curvature)))
-        if n - len(out) < FEWEST:  # nothing tells how far nights scatter
+        unit = _unit(data)
+        if len(self.values) - len(out) < FEWEST:  # nothing tells how far nights scatter
             return Posterior(data, factor, np.full(self.degrees.max(), unit * _RANGE[0]))
         return most_likely(data, factor, np.full(self.degrees.max(), 3 * unit), unit * np.array(_RANGE))
 
@@ -263,37 +242,36 @@ class _Means:
         others = self._posterior(unseen) if others is None else others
         scatter = others.sizes[self.degrees - 1] ** 2
         if screened:  # what it departs by from the prediction of all others follows from the posterior of all
-            covariance = np.linalg.inv(self._precision(others, k))
+            precision = self._precision(others, k)
+            covariance = np.linalg.inv(precision + np.eye(len(precision)) / _FREE**2)
             away = covariance @ (others.left[0][rows] / scatter)
         else:
             free = others if unseen == out | {k} else self._posterior(out | {k}, others.sizes)
             away, covariance = free.left[0][rows], free.of_rows[rows, rows] + np.diag(scatter)
-        size, directions = np.linalg.eigh(covariance - np.diag(scatter))
-        directions = directions[:, size < _KNOWN**2 + scatter.max()].T
-        if not len(directions):
+        whole = away, covariance
+        pull, covariance = _told(*whole, scatter, np.full(len(away), True))
+        if not len(pull):
             return NightTest()
-        pull = directions @ away
-        chi2 = max(pull @ np.linalg.solve(directions @ covariance @ directions.T, pull), 0)
+        chi2 = max(pull @ np.linalg.solve(covariance, pull), 0)
         freedom, even = np.full(len(others.sizes), np.inf), np.ones(len(others.sizes))
         if n > FEWEST:
             freedom, even = self._freedom(others, unseen), self._evenness(others, unseen)
         p = [
-            _chance(away, covariance, self.degrees == degree, freedom[degree - 1], even[degree - 1])
+            _chance(*_told(*whole, scatter, self.degrees == degree), freedom[degree - 1], even[degree - 1])
             for degree in set(self.degrees)
         ]
-        p, ratio = min(1.0, len(p) * min(p)), np.sqrt(chi2 / len(directions))
+        p, ratio = min(1.0, len(p) * min(p)), np.sqrt(chi2 / len(pull))
         odd = n - len(out | {k}) >= FEWEST and p < alarm and ratio > ODD
-        return NightTest(
-            float(np.linalg.norm(pull) / 2), float(ratio), float(chi2), len(directions), float(p), bool(odd)
-        )
+        return NightTest(float(np.linalg.norm(pull) / 2), float(ratio), float(chi2), len(pull), float(p), bool(odd))
 
     def _freedom(self, posterior, unseen):
         """Degrees of freedom, by degree, of the squares of those nights from which the scatter was found."""
-        out = np.zeros(len(posterior.sizes))
+        out, size = np.zeros(len(posterior.sizes)), len(self.degrees)
         scatter = np.diag(posterior.sizes[self.degrees - 1] ** 2)
         for k in set(range(len(self.values))) - set(unseen):
-            share = np.diag((self.covariance[k] + scatter) @ self._precision(posterior, k))
-            out += np.bincount(self.degrees - 1, share, len(out))
+            own = self.data.curvature[k * size :, k * size :][:size, :size] + np.eye(size) / _FREE**2
+            share = np.diag((np.linalg.inv(own) + scatter) @ self._precision(posterior, k))
+            out += np.bincount(self.degrees - 1, np.clip(share, 0, 1), len(out))
         return out
 
     def _evenness(self, posterior, unseen):
@@ -309,7 +287,8 @@ class _Means:
         square, expected = (each.reshape(n, k)[seen].sum(axis=0) for each in (square, expected))
         ratio, out = square / np.maximum(expected, 1e-300), np.ones(len(posterior.sizes))
         for degree in set(self.degrees):
-            mine = ratio[self.degrees == degree]
+            mine = self.degrees == degree
+            mine = ratio[mine & (expected > _ALIKE * expected[mine].max())]
             fourth = np.mean(mine**2) / (1 + 2 / max(np.count_nonzero(seen) - 1, 1))
             out[degree - 1] = np.clip(np.mean(mine) ** 2 / max(fourth, 1e-300), 1 / len(mine), 1)
         return out
@@ -322,29 +301,72 @@ class _Means:
         return (out + out.T) / 2
 
 
-def _chance(away, covariance, of, dof, even):
-    """Probability of a departure in some coefficients, whose squares are compared with others of so many degrees.
+def _told(away, covariance, scatter, of):
+    """Departure and covariance of some coefficients (K,), in the orthonormal directions that the data determine."""
+    size, directions = np.linalg.eigh(covariance[np.ix_(of, of)] - np.diag(scatter[of]))
+    directions = directions[:, size < _KNOWN**2 + scatter[of].max()].T
+    return directions @ away[of], directions @ covariance[np.ix_(of, of)] @ directions.T
+
+
+def _chance(away, covariance, dof, even):
+    """Probability of a departure (m,), whose squares are compared with others of so many degrees.
 
     `even` is the part of them that scatter.
     """
-    m, square = np.count_nonzero(of), away[of] @ np.linalg.solve(covariance[np.ix_(of, of)], away[of])
+    m = len(away)
+    if not m:
+        return 1.0
+    square = away @ np.linalg.solve(covariance, away)
     if np.isinf(dof):
         return special.chdtrc(even * m, even * square)
     return special.fdtrc(even * m, even * dof, square / m) if even * dof >= 1 else 1.0
 
 
-def _within(apart, noise, owner, degrees):
-    """Variance (n_nights, K) of the means of nights by how far their exposures are apart from these (n, K), by degree.
+def _unit(data):
+    """Typical error of a coefficient of data [pix]."""
+    return 1 / np.sqrt(np.median(np.diag(data.curvature)))
 
-    That of a night whose exposures scatter more than those of the others is its own.
+
+def _within(data, apart, owner, degrees):
+    """Variance (n_nights, K) of exposures about what those of their night have in common, by degree.
+
+    From data on the steps of all coefficients, where these are apart (n_exposures, K) from one another. That of a night
+    whose exposures scatter more than those of the others, beyond chance, is its own.
     """
-    count = np.bincount(owner)
-    mean = np.eye(len(count))[:, owner] / count[:, None]
-    by_degree = (degrees == np.unique(degrees)[:, None]).astype(float)
-    squares = (count[:, None] * mean) @ apart**2 @ by_degree.T
-    expected = (count[:, None] * mean) @ noise @ by_degree.T * (1 - 1 / count)[:, None]
-    free = (count - 1)[:, None] * by_degree.sum(axis=1)
-    excess, others = squares - expected, ~np.eye(len(count), dtype=bool)
-    theirs = np.maximum(others @ excess, 0) / np.maximum(others @ free, 1)
-    own = np.where(free > 0, excess / np.maximum(free, 1), 0)
-    return np.maximum(theirs, own) @ by_degree / count[:, None]
+    k, count, most = apart.shape[1], np.bincount(owner), degrees.max()
+    own = np.zeros((len(count), most))
+    for night in np.flatnonzero(count > 1):
+        mine = np.flatnonzero(owner == night)
+        rows = (mine[:, None] * k + np.arange(k)).ravel()
+        part = ReducedData(data.curvature[np.ix_(rows, rows)], data.pull[rows], 0.0, len(rows))
+        departures = sparse.hstack(
+            [sparse.eye_array(len(rows)), sparse.kron(np.ones((len(mine), 1)), -np.eye(k))], format="csr"
+        )
+        mean = sparse.eye_array(k, len(rows) + k, k=len(rows), format="csr")
+        value, size = apart[mine].ravel(), np.tile(degrees - 1, len(mine))
+        factor = Factor.joined([
+            Factor("departures of the exposures", departures, value, np.ones(len(value)), size),
+            Factor("departure of the night", mean, np.zeros(k), np.full(k, _FREE), np.full(k, GIVEN)),
+        ])  # fmt: skip
+        unit = _unit(part)
+        own[night] = most_likely(part, factor, np.full(most, 3 * unit), unit * np.array(RANGE)).sizes ** 2
+    free, others = (count - 1)[:, None], ~np.eye(len(count), dtype=bool)
+    theirs = others @ (free * own) / np.maximum(others @ free, 1)
+    modes = np.bincount(degrees - 1)
+    limit = special.fdtri(np.maximum(free, 1) * modes, np.maximum(others @ free, 1) * modes, _WIDER)
+    return np.where(own > limit * theirs, own, theirs)[:, degrees - 1]
+
+
+def _shared(data, apart, owner, scatter):
+    """Data on steps of what exposures of a night have in common, their scatter by so much (n_nights, K) eliminated.
+
+    ``z = e + P v + d`` with ``d ~ N(0, W)``: curvature ``P' R (1 + W R)^-1 P`` and slope ``P' (1 + R W)^-1 (g - R e)``
+    for v, of data with curvature R and slope g.
+    """
+    k = apart.shape[1]
+    common = np.kron(np.eye(len(scatter))[owner], np.eye(k))
+    width = scatter[owner].ravel()
+    solved = np.linalg.solve(np.eye(len(width)) + width[:, None] * data.curvature, common)
+    curvature = common.T @ data.curvature @ solved
+    pull = solved.T @ (data.pull + data.curvature @ apart.ravel())
+    return ReducedData((curvature + curvature.T) / 2, pull, 0.0, len(pull))

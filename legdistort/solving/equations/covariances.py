@@ -193,13 +193,24 @@ class Uncertainty:
 
     @property
     def _moving(self):
-        """The reduced system in which maps move the plane; widths about a mean that is not exact move along."""
+        """The reduced system in which maps move the plane."""
+        return self._of_maps(self._blocks, self.system)
+
+    def _of_maps(self, blocks, system):
+        """That in which maps move the plane: widths about a mean that is not exact move along.
+
+        Parameters
+        ----------
+        blocks : Blocks
+        system : ReducedSystem
+            Of these, with the widths.
+        """
         if self._problem.prior_sigma is None or self._gauge.static == "exact":
-            return self.system
-        problem, blocks = replace(self._problem, prior_sigma=None), replace(self._blocks, u=self._blocks.u_data)
+            return system
+        problem, blocks = replace(self._problem, prior_sigma=None), replace(blocks, u=blocks.u_data)
         with contextlib.suppress(SolveError):  # exposures of few stars have widths alone
             return reduced_system.reduced_system(problem, blocks, self._gauge)
-        return self.system
+        return system
 
     def _directions(self, system):
         gauge = self._gauge
@@ -241,8 +252,8 @@ class Uncertainty:
         All x first; each for the same change of what holds the solution as here. They turn as the solution moves along
         them, which is of second order.
         """
-        n, system = self._gauge.n_constraints, self._system_at(positions, coefficients, poses)
-        maps = self._directions(system)
+        n, (blocks, system) = self._gauge.n_constraints, self._at(positions, coefficients, poses)
+        maps = self._directions(self._of_maps(blocks, system))
         columns = [(maps @ each.map).T.ravel() for each in self._gauge.unknown_maps]
         here, there = self.system.moves[n:], system.moves[n:]
         if self.weak:
@@ -254,15 +265,15 @@ class Uncertainty:
 
     def directions_at(self, positions: np.ndarray, coefficients: np.ndarray, poses: Any) -> np.ndarray:
         """`directions` where the solution has moved to, (2 n_stars, 2 n_modes), all x first."""
-        maps = self._directions(self._system_at(positions, coefficients, poses))
+        maps = self._directions(self._of_maps(*self._at(positions, coefficients, poses)))
         return maps.transpose(1, 0, 2).reshape(2 * len(maps), -1)
 
-    def _system_at(self, positions, coefficients, poses):
-        """The reduced system there, with the same constraints."""
+    def _at(self, positions, coefficients, poses):
+        """Normal equations and reduced system there, with the same constraints."""
         stars = np.concatenate([positions.T, self._blocks.stars[2:]])
         blocks = criterion.linearise(self._problem, State(stars, coefficients, poses))
         rows = self.system.rows[self._gauge.n_constraints :]
-        return reduced_system.reduced_system(self._problem, blocks, self._gauge, rows)
+        return blocks, reduced_system.reduced_system(self._problem, blocks, self._gauge, rows)
 
     def _unit(self, stars):
         """Rms per axis of what moves the stars (2, n_stars)."""
