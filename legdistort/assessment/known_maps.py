@@ -8,6 +8,7 @@ from scipy import special
 
 from ..cameras.camera import Camera
 from ..cameras.detector import map_alone, widths_alone
+from ..cameras.places import common_modes, whole_map
 from ..cameras.stated_errors import FREE
 from ..exceptions import InputError
 from ..geometry import basis, detector_modes
@@ -131,7 +132,7 @@ def _of_camera(camera, label, common=None):
         widths = [widths_alone(each, statics[key].shape[1]) for key, each in camera.detectors.items()]
         covariance = np.diag(np.concatenate([np.minimum(each.ravel(), NOTHING) ** 2 for each in widths]))
         if n:
-            maps = [_common_maps(camera, each, n).reshape(2, n, -1) for each in camera.detectors.values()]
+            maps = [common_modes(camera, each, n).reshape(2, n, -1) for each in camera.detectors.values()]
             whole = [np.pad(each, ((0, 0), (0, max(w.shape[1] - n, 0)), (0, 0)))[:, : w.shape[1]]
                      for each, w in zip(maps, widths, strict=True)]  # fmt: skip
             shared = np.concatenate([each.reshape(-1, 2 * n) for each in whole])
@@ -162,7 +163,7 @@ def _of_focal_plane(solution, label):
     known = _of_camera(camera, label)
     n = int(np.flatnonzero(errors.free.any(axis=(0, 1))).max()) + 1  # what is beyond was given, and not asked
     free = errors.free[:, :, :n]
-    common = np.concatenate([_common_maps(camera, each, n) for each in camera.detectors.values()])
+    common = np.concatenate([common_modes(camera, each, n) for each in camera.detectors.values()])
     mean, covariance, shared = common_distortion(solution, n)
     moved = common @ shared
     moved[free.ravel()] += errors.changes
@@ -178,28 +179,7 @@ def _of_focal_plane(solution, label):
 
 def _whole(camera, detector, common):
     """Coefficients of all that displaces on a detector, with a `common` distortion (2, n) of the focal plane."""
-    pose, static = map_alone(detector)
-    degree, back = basis.degree_of(max(static.shape[1], common.shape[1])), invert(pose)
-
-    def displacement(u, v):
-        q = basis.denormalize(u, v, detector.shape)
-        f = apply(back, q)
-        modes = basis.values(basis.degree_of(common.shape[1]), *basis.normalize(f, camera.field))
-        return (detector.to_pixels(f + (common @ modes).T) - q).T
-
-    return basis.project(displacement, degree)
-
-
-def _common_maps(camera, detector, n):
-    """Coefficients (2 n, 2 n) on a detector of the modes of the focal plane."""
-    degree, back = basis.degree_of(n), invert(detector.layout)
-
-    def modes(u, v):
-        there = apply(back, basis.denormalize(u, v, detector.shape))
-        return basis.values(degree, *basis.normalize(there, camera.field))
-
-    alone = basis.project(modes, degree)
-    return np.einsum("ab,mk->akbm", detector.layout[:, :2], alone).reshape(2 * n, 2 * n)
+    return whole_map(camera, detector, common, map_alone(detector)[0])
 
 
 def _of_night(solution, label, other):

@@ -31,7 +31,8 @@ from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees import codec
 from ..runtime.trees.facts import SIZE, array, keyed
 from . import storage
-from .detector import Detector
+from . import places as found_places
+from .detector import Detector, Place
 from .from_wcs import camera_of, fullest, header_map, moved_plane, stated_detectors
 from .header_layout import HeaderLayout, compare_headers
 from .source import check_shape
@@ -91,6 +92,10 @@ class Camera(ShownAsPrinted):
     header_map : array_like, shape (2, 3), optional
         Similarity from the plane of the `header_layout` of the detectors to the focal plane: with a `common_map` as the
         sky was found, which carries scale and rotation to headers of further exposures, else as the layouts have it.
+    place_errors : array_like, shape (n_detectors, 3), optional
+        Standard deviations of x, y [pix] and rotation [deg] of the `places` with the `common_map`, after one affine map
+        of all detectors, with what layouts and map have in common; infinite where nothing is known. None: the errors of
+        both count as independent.
 
     Raises
     ------
@@ -120,6 +125,7 @@ class Camera(ShownAsPrinted):
     )
     common_map: np.ndarray | None = stored(default=None, metadata=array(2, "modes", unit="pix"))
     header_map: np.ndarray | None = stored(default=None, metadata=array(2, 3, unit="pix", invertible=True))
+    place_errors: np.ndarray | None = stored(default=None, metadata=array("n_chips", 3, minimum=0, infinite=True))
 
     def __post_init__(self) -> None:
         if not isinstance(self.detectors, dict) or not self.detectors:
@@ -135,6 +141,7 @@ class Camera(ShownAsPrinted):
         field = first.shape if self.field is None and first.is_plain and not others else self.field
         object.__setattr__(self, "common_sigma", _common(self.common_sigma))
         object.__setattr__(self, "common_map", _common_map(self.common_map, self.common_sigma))
+        object.__setattr__(self, "place_errors", _place_errors(self.place_errors, len(detectors)))
         if self.header_map is not None:
             object.__setattr__(self, "header_map", similarity.check(self.header_map, "header_map"))
         if first.is_plain and not others and self.common_sigma is None and field == first.shape:
@@ -198,6 +205,15 @@ class Camera(ShownAsPrinted):
     def states_static(self) -> bool:
         """Whether anything is known of the static distortion of a detector."""
         return any(np.any(each.static) or each.static_sigma is not None for each in self.detectors.values())
+
+    @property
+    def places(self) -> dict[str, Place]:
+        """Where the detectors lie, ``{id: Place}``: by their layouts (`Detector.place`), with a bend of all together.
+
+        That is the `common_map` that a reference told, where layouts and static distortions were found, which do not
+        contain it; errors then are those after one affine map of all detectors.
+        """
+        return found_places.places(self)
 
     def __getitem__(self, key: str) -> Detector:
         """The `Detector` of an id."""
@@ -320,14 +336,14 @@ class Camera(ShownAsPrinted):
             return figures | dict(zip(("x_error", "y_error", "rotation_error_deg"), errors, strict=True))
 
         detectors = [
-            {"id": key, "shape": list(each.shape), "static_rms_px": each.rms} | stated(each.place)
-            for key, each in self.detectors.items()
+            {"id": key, "shape": list(self[key].shape), "static_rms_px": self[key].rms} | stated(place)
+            for key, place in self.places.items()
         ]
         return {"name": self.name, "field": list(self.field), "detectors": detectors}
 
     def table_lines(self) -> list[str]:
         """Lines of a table of where the detectors lie, with the errors of that where it is not exact."""
-        places = {key: each.place for key, each in self.detectors.items()}
+        places = self.places
         known = any(place.errors is not None for place in places.values())
         errors, width = f" {'+-':>8s}" * known, max(10, *map(len, places))
         lines = [
@@ -547,6 +563,16 @@ def _common_map(coefficients, sigma):
     if sigma is None or sigma.shape[1] < out.shape[1]:
         raise InputError("common_map needs the errors of all of its modes: give common_sigma (2, n_modes)")
     return basis.change_degree(out, basis.degree_of(sigma.shape[1]))
+
+
+def _place_errors(errors, n):
+    """`place_errors` as an array (n, 3), or None."""
+    if errors is None:
+        return None
+    out = np.array(errors, dtype=float)
+    if out.shape != (n, 3) or not np.all(out >= 0):
+        raise InputError(f"place_errors must be standard deviations ({n}, 3), none negative or NaN, got {errors!r}")
+    return out
 
 
 def _shifted(detector, first):

@@ -195,21 +195,25 @@ class Detector(ShownAsPrinted):
 
     @property
     def place(self) -> Place:
-        """The `Place` of the detector."""
+        """The `Place` of the detector, by its layout alone; see `Camera.places`."""
         middle = basis.denormalize(np.zeros(1), np.zeros(1), self.shape)
         x, y = similarity.apply(similarity.invert(self.layout), middle)[0]
         m, errors = self.layout[:, :2], None
         parity = np.sign(np.linalg.det(m))
         rotation = np.degrees(np.arctan2(m[1, 0] - parity * m[0, 1], m[0, 0] + parity * m[1, 1]))  # without the shear
         if self.layout_sigma is not None:
-            (ny, nx), back = self.shape, np.linalg.inv(m)
             covariance = self.layout_covariance
             covariance = np.diag(self.layout_sigma.ravel() ** 2) if covariance is None else covariance
-            weights = np.zeros((3, 6))
-            weights[:2, [0, 3]] = back / 2  # L_0 is 1/2
-            weights[2, [2, 4]] = np.degrees(np.sqrt(0.75)) * np.array([-1 / ny, 1 / nx])  # half the curl, sqrt(3)/2 u
-            errors = tuple(_error(row, covariance) for row in weights)
+            errors = tuple(_error(row, covariance) for row in self.place_weights)
         return Place(float(x), float(y), float(rotation), float(np.sqrt(abs(np.linalg.det(m)))), errors)
+
+    @property
+    def place_weights(self) -> np.ndarray:
+        """How x, y [pix] and rotation [deg] of its place follow the modes of `layout_sigma`, (3, 6); signs aside."""
+        (ny, nx), weights = self.shape, np.zeros((3, 6))
+        weights[:2, [0, 3]] = np.linalg.inv(self.layout[:, :2]) / 2  # L_0 is 1/2
+        weights[2, [2, 4]] = np.degrees(np.sqrt(0.75)) * np.array([-1 / ny, 1 / nx])  # half the curl, sqrt(3)/2 u
+        return weights
 
     @property
     def rms(self) -> float:

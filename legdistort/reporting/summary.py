@@ -131,7 +131,7 @@ def _in_common(departing):
 
 def detectors(camera):
     """One dict of numbers a detector: its place in the focal plane, with errors where it is not exact."""
-    out, headers, off = [], camera.headers, {}
+    out, headers, places, off = [], camera.headers, camera.places, {}
     if headers is not None:
         off = dict(
             zip(
@@ -141,7 +141,7 @@ def detectors(camera):
             )
         )
     for key, each in camera.detectors.items() if camera.has_focal_plane else ():
-        place = each.place
+        place = places[key]
         x_off, y_off, turned, off_err, turned_err = off.get(key, (None,) * 5)
         x_err, y_err, rotation_err = map(_plain, place.errors or (None, None, None))
         out.append(

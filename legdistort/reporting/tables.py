@@ -193,9 +193,10 @@ def _how_known(numbers):
 def detectors_table(camera, after=""):
     """One row a detector: where it lies, with the errors of that, and the size of its static distortion."""
     head = {"detector": "", "centre x": "px", "centre y": "px", "rotation": "deg", "scale": "", "static": "rms, px"}
-    rows = []
+    rows, places = [], camera.places
     for key, each in camera.detectors.items():
-        place, errors = each.place, each.place.errors or (None, None, None)
+        place = places[key]
+        errors = place.errors or (None, None, None)
         values = (place.x, 3), (place.y, 3), (place.rotation, 5)
         cells = [_with_error(*value, error) for value, error in zip(values, errors, strict=True)]
         rows.append(Row([key, *cells, f"{place.scale:.6f}", f"{each.rms:.3f}"]))

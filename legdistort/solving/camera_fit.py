@@ -247,7 +247,7 @@ class CameraFit:
         unknown = _unknown(fit.matches.camera, step)
         _tell_unknown(fit.matches, step, unknown)
         camera = with_errors(fit.matches.camera, step, unknown)
-        camera = replace(camera, common_sigma=common_widths(camera, self.sought))
+        camera = replace(camera, common_sigma=common_widths(camera, self.sought), place_errors=None)
         matches = replace(fit.matches, camera=camera)
         errors = replace(_errors(fit, step, unknown), departure=self._from_stated(camera))
         fit = replace(fit, matches=matches, camera_errors=errors, shared_unknowns=step.freedom)

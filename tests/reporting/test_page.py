@@ -381,6 +381,6 @@ def test_solved_set_gives_a_page(tmp_path):
     ],
 )
 def test_values_of_detectors_have_the_digits_of_their_errors(errors, cells):
-    detector = SimpleNamespace(place=Place(136.15819, -0.7524, 0.014917, 1.0, errors), rms=0.1)
-    (row,) = detectors_table(SimpleNamespace(detectors={"1": detector})).rows
+    place, detector = Place(136.15819, -0.7524, 0.014917, 1.0, errors), SimpleNamespace(rms=0.1)
+    (row,) = detectors_table(SimpleNamespace(detectors={"1": detector}, places={"1": place})).rows
     assert row.cells[1:4] == cells

@@ -96,7 +96,7 @@ def test_a_night_has_what_its_exposures_have_in_common():
 def test_every_detector_is_in_figures():
     solution = solve(four_detectors.matches("layout", 1, n=5, n_stars=120), layout="fit", degree=1)
     found = _valid(summarise(solution))
-    places = {key: each.place for key, each in solution.camera.detectors.items()}
+    places = solution.camera.places
     assert {each["name"]: (each["x_px"], each["y_px"]) for each in found["detectors"]} == {
         key: (place.x, place.y) for key, place in places.items()
     }

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...cameras.places import relative_errors, shifts_and_turns
 from ...cameras.stated_errors import UNKNOWN
 from ...geometry import basis, detector_modes
 from . import absolute_errors
@@ -50,16 +51,42 @@ def with_common_map(camera, solution):
     n_exposures, _, n = solution.coefficients.shape
     if solution.gauge.tie is None or solution.gauge.n_fields > 1 or not camera.has_focal_plane:
         return camera
-    mean, covariance, _ = common_distortion(solution, n)
+    mean, covariance, shared = common_distortion(solution, n)
     rows = detector_modes.dynamic_basis(camera.field, n)
-    variance = np.einsum("ka,ab,kb->k", rows, covariance, rows)
+    covariance, sigma = rows @ covariance @ rows.T, np.full(len(rows), np.inf)
     if n_exposures > 1:
         scatter = solution.coefficients.reshape(n_exposures, -1) @ rows.T
-        variance += scatter.var(axis=0, ddof=1) / n_exposures
-    sigma = np.sqrt(variance) if n_exposures > 1 else np.full(len(rows), np.inf)
+        covariance += np.diag(scatter.var(axis=0, ddof=1) / n_exposures)
+        sigma = np.sqrt(np.diag(covariance))
     sigma = np.where(sigma < UNKNOWN, sigma, np.inf)
     widths = np.max(np.where(rows != 0, sigma[:, None], 0), axis=0, initial=0).reshape(2, n)
     fitted = basis.n_modes(solution.degree)
     if camera.common_sigma is not None:
         widths[:, fitted:] = basis.change_degree(camera.common_sigma, basis.degree_of(n))[:, fitted:]
-    return replace(camera, common_map=np.where(np.isinf(widths), 0, mean.reshape(2, n)), common_sigma=widths)
+    known = {"common_map": np.where(np.isinf(widths), 0, mean.reshape(2, n)), "common_sigma": widths}
+    there = np.isfinite(sigma)
+    errors = _errors_of_places(solution, rows[there], covariance[np.ix_(there, there)], shared)
+    return replace(camera, **known, place_errors=errors)
+
+
+def _errors_of_places(solution, rows, covariance, shared):
+    """Errors (n_detectors, 3) of places with a common map; None where layouts were not found.
+
+    Parameters
+    ----------
+    solution : Solution
+    rows : ndarray, shape (k, 2 n)
+        What is known of the map.
+    covariance : ndarray, shape (k, k)
+        Of that, a camera taken as known.
+    shared : ndarray, shape (2 n, r)
+        Responses of the map to the errors of the camera, which layouts have too.
+    """
+    errors, camera = solution.estimate.uncertainty.camera, solution.camera
+    if errors is None or not errors.free[:, :, :3].any():
+        return None
+    bent = shifts_and_turns(camera, rows.shape[1] // 2) @ rows.T
+    own = np.zeros((*errors.free.shape, errors.changes.shape[1]))
+    own[errors.free] = errors.changes
+    moved = own[:, :, :3].reshape(len(bent), -1) + bent @ rows @ shared
+    return relative_errors(camera, moved @ moved.T + bent @ covariance @ bent.T)

@@ -1,0 +1,112 @@
+"""Where detectors lie, with a bend of the focal plane that all of them have in common.
+
+Where static distortions are fitted, exposures and detectors can exchange a map of the focal plane, and layouts do not
+contain it. If a reference told it (`Camera.common_map`), the place of a detector is that of its whole map, from the
+plane as the sky shows it to undistorted pixels: the affine part of ``P (f + C(f))``, C the common map.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..geometry import basis, similarity
+from .detector import Detector
+
+
+def whole_map(camera, detector, common, pose):
+    """Coefficients (2, n_modes) of all that displaces on a detector, beside a pose (2, 3) from the focal plane to it.
+
+    Parameters
+    ----------
+    camera : Camera
+    detector : Detector
+    common : ndarray, shape (2, n)
+        Distortion of the focal plane.
+    pose : ndarray, shape (2, 3)
+    """
+    degree, back = basis.degree_of(max(detector.static.shape[1], common.shape[1])), similarity.invert(pose)
+
+    def displacement(u, v):
+        q = basis.denormalize(u, v, detector.shape)
+        f = similarity.apply(back, q)
+        modes = basis.values(basis.degree_of(common.shape[1]), *basis.normalize(f, camera.field))
+        return (detector.to_pixels(f + (common @ modes).T) - q).T
+
+    return basis.project(displacement, max(degree, 1))
+
+
+def common_modes(camera, detector, n):
+    """Coefficients (2 n, 2 n) on a detector of n modes per axis of the focal plane."""
+    degree, back = basis.degree_of(n), similarity.invert(detector.layout)
+
+    def modes(u, v):
+        there = similarity.apply(back, basis.denormalize(u, v, detector.shape))
+        return basis.values(degree, *basis.normalize(there, camera.field))
+
+    alone = basis.project(modes, degree)
+    return np.einsum("ab,mk->akbm", detector.layout[:, :2], alone).reshape(2 * n, 2 * n)
+
+
+def shifts_and_turns(camera, n):
+    """Layout modes (6 n_detectors, 2 n) of all detectors, by the n modes per axis of a map of the focal plane."""
+    each = [common_modes(camera, detector, n) for detector in camera.detectors.values()]
+    return np.concatenate([modes.reshape(2, n, 2 * n)[:, :3].reshape(6, 2 * n) for modes in each])
+
+
+def exchanges_a_bend(camera):
+    """Whether layouts and static distortions were found, so that exposures may have taken over a bend of theirs."""
+    each = camera.detectors.values()
+    found = [d.layout_covariance is not None and d.static_sigma is not None and np.any(d.static_sigma) for d in each]
+    return camera.has_focal_plane and any(found)
+
+
+def places(camera):
+    """The `Place` of every detector, ``{id: Place}``; see `Camera.places`."""
+    if camera.common_map is None or not exchanges_a_bend(camera):
+        return {key: each.place for key, each in camera.detectors.items()}
+    errors = camera.place_errors
+    errors = relative_errors(camera, _independent(camera)) if errors is None else errors
+    out = {}
+    for (key, each), row in zip(camera.detectors.items(), errors, strict=True):
+        whole = Detector(
+            each.shape, layout=each.layout, static=whole_map(camera, each, camera.common_map, each.layout)
+        ).placed()
+        out[key] = replace(whole.place, errors=tuple(row.tolist()))
+    return out
+
+
+def relative_errors(camera, covariance):
+    """Standard deviations (n_detectors, 3) of x, y and rotation of all detectors, after one affine map of them.
+
+    Infinite for detectors of which nothing determines the layout.
+
+    Parameters
+    ----------
+    camera : Camera
+    covariance : ndarray, shape (6 n_detectors, 6 n_detectors)
+        Of the modes of their layouts.
+    """
+    each = list(camera.detectors.values())
+    known = np.array([d.layout_sigma is None or bool(np.isfinite(d.layout_sigma).all()) for d in each])
+    rows = np.repeat(known, 6)
+    common = shifts_and_turns(camera, 3)[rows]
+    left = np.eye(len(common)) - (common @ np.linalg.pinv(common) if np.count_nonzero(known) > 1 else 0.0)
+    blocks = (left @ covariance[np.ix_(rows, rows)] @ left.T).reshape(-1, 6, np.count_nonzero(known), 6)
+    out = np.full((len(each), 3), np.inf)
+    for i, k in enumerate(np.flatnonzero(known)):
+        weights = each[k].place_weights
+        out[k] = np.sqrt(np.maximum(np.diag(weights @ blocks[i, :, i] @ weights.T), 0.0))
+    return out
+
+
+def _independent(camera):
+    """Covariance of the layouts with the `common_map`, as if the errors of both had nothing in common."""
+    known = np.where(np.isfinite(camera.common_sigma), camera.common_sigma, 0.0)
+    moved = shifts_and_turns(camera, known.shape[1]) * known.ravel()
+    out = moved @ moved.T
+    for k, each in enumerate(camera.detectors.values()):
+        if each.layout_sigma is not None:
+            own = np.diag(each.layout_sigma.ravel() ** 2) if each.layout_covariance is None else each.layout_covariance
+            part = slice(6 * k, 6 * k + 6)
+            out[part, part] += np.where(np.isinf(own), 0.0, own)
+    return out
