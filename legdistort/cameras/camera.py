@@ -30,8 +30,8 @@ from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees import codec
 from ..runtime.trees.facts import SIZE, array, keyed
-from . import storage
 from . import places as found_places
+from . import storage
 from .detector import Detector, Place
 from .from_wcs import camera_of, fullest, header_map, moved_plane, stated_detectors
 from .header_layout import HeaderLayout, compare_headers

@@ -99,6 +99,18 @@ def relative_errors(camera, covariance):
     return out
 
 
+def largest_by_bend(camera, degree):
+    """Largest shift [pix] and rotation [deg] of a detector by a map of 1 px rms of degrees 2 to `degree`."""
+    orders = np.add(*basis.orders(degree))
+    bends = shifts_and_turns(camera, basis.n_modes(degree))[:, np.tile(orders > 1, 2)]
+    found = []
+    for each, moved in zip(camera.detectors.values(), bends.reshape(len(camera.detectors), 6, -1), strict=True):
+        x, y, turn = each.place_weights @ moved
+        # modes have mean square 1/4: coefficients of a map of 1 px rms, both axes together, are 2 px long
+        found.append([2 * np.linalg.norm(np.stack([x, y]), 2), 2 * np.linalg.norm(turn)])
+    return np.max(found, axis=0)
+
+
 def _independent(camera):
     """Covariance of the layouts with the `common_map`, as if the errors of both had nothing in common."""
     known = np.where(np.isfinite(camera.common_sigma), camera.common_sigma, 0.0)

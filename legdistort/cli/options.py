@@ -155,7 +155,7 @@ REPLACING = {"overwrite": Option("replace a picture that exists", action="store_
 KNOWN_STATIC = {
     "prior": Option("known static distortion, see the command prior; header: of the frames of run", path="read"),
     "static_sigma": Option(
-        "uncertainty of a coefficient of it; without --prior its size, nothing else being known",
+        "uncertainty of a coefficient of it; without --prior its size, of every detector of a camera",
         type=float,
         metavar="PIXELS",
     ),

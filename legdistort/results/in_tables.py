@@ -8,7 +8,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from astropy.time import Time
 
-from ..cameras import ties
+from ..cameras import places, ties
 from ..cameras.star_scales import flux_factors
 from ..exceptions import by_reason, some_of
 from ..geometry import basis
@@ -340,18 +340,32 @@ _RMS = "dx", "dy"
 
 def layout_errors(solution):
     """What the errors of a layout that was fitted leave out, in words; empty where none was."""
-    errors, common = solution.estimate.uncertainty.camera, solution.camera.common_sigma
+    errors, camera = solution.estimate.uncertainty.camera, solution.camera
+    common = camera.common_sigma
     if errors is None or not solution.camera.has_focal_plane or not errors.free[:, :, :3].any():
         return ""
     degree = 1
     if common is not None:  # infinite where exposures take over what detectors have in common
         orders = np.add(*basis.orders(basis.degree_of(common.shape[1])))
         degree = orders[np.isinf(common).any(axis=0)].max(initial=1)
+    if places.exchanges_a_bend(camera) and solution.gauge.tie is None and solution.gauge.static == "none":
+        degree = max(degree, solution.degree)
     which = "one affine map" if degree < 2 else f"one map of degree {degree}"
     unknown = f", and {solution.gauge.unknown_in_words}" if solution.gauge.unknown_names else ""
+    bend = ""
+    if camera.place_errors is not None and places.exchanges_a_bend(camera):
+        bend = "; a bend of all together, as the reference tells it, is in places and errors"
+    elif degree > 1:
+        shift, turn = places.largest_by_bend(camera, degree)
+        bend = (
+            f"; a bend of all together by 1 px rms, which a reference would tell (--reference), shifts single ones by "
+            f"up to {shift:.2g} px and turns them by up to {turn:.2g} deg"
+        )
+    unsettled = "; the fit did not settle, and these errors do not hold" * bool(errors.unsettled)
     return (
         f"errors of the layout are those of detectors relative to each other, after {which} of all together, which "
         f"exposures take over{unknown} (not determined): places and rotations in the focal plane are not known so well"
+        f"{bend}{unsettled}"
     )
 
 

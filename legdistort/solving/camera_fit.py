@@ -19,6 +19,7 @@ from ..cameras.detector import affine_of
 from ..cameras.stated_errors import resized
 from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, LegdistortError, SolveError, warn
 from ..geometry import basis, similarity
+from ..priors.prior import Prior
 from ..results.errors.camera_errors import CameraErrors, Departure, moved_by, unit_errors
 from ..results.new_positions import widened_all
 from ..runtime.checks import check_choice
@@ -133,8 +134,8 @@ class Sought:
                 continue
             if kind == "prior" and not known:
                 raise InputError(
-                    f"{name}='prior' needs the uncertainty of every detector (Detector(..., {name}_sigma=)): give it, "
-                    f"or {name}='fit'"
+                    f"{name}='prior' needs the uncertainty of every detector (--{name}-sigma, Detector(..., "
+                    f"{name}_sigma=)): give it, or {name}='fit' (--{name} fit)"
                 )
             fitted = slice(part.start, basis.n_modes(degree)) if name == "static" and kind == "fit" else part
             free[:, :, fitted] = True
@@ -243,13 +244,14 @@ class CameraFit:
         if step.length >= _SMALL:
             words = f"layouts and static distortions not, whose last step was {step.length:.2g} of their errors"
             fit = replace(fit, result=replace(fit.result, status=f"{fit.result.status}; {words}"))
-            warn(f"{words} (of {_STEPS} steps): see the checks, and the ties of the detectors", ConvergenceWarning)
+            warn(f"{words} (of {_STEPS} steps), and errors do not hold: see the check camera", ConvergenceWarning)
         unknown = _unknown(fit.matches.camera, step)
         _tell_unknown(fit.matches, step, unknown)
         camera = with_errors(fit.matches.camera, step, unknown)
         camera = replace(camera, common_sigma=common_widths(camera, self.sought), place_errors=None)
         matches = replace(fit.matches, camera=camera)
-        errors = replace(_errors(fit, step, unknown), departure=self._from_stated(camera))
+        unsettled = step.length if step.length >= _SMALL else 0.0
+        errors = replace(_errors(fit, step, unknown), departure=self._from_stated(camera), unsettled=unsettled)
         fit = replace(fit, matches=matches, camera_errors=errors, shared_unknowns=step.freedom)
         return _with_common_map(fit, step) if fit.problem.floats else fit
 
@@ -414,6 +416,34 @@ def held(matches, layout, static):
         return matches
     detectors = {key: replace(each, **exact) for key, each in matches.camera.detectors.items()}
     return replace(matches, camera=replace(matches.camera, detectors=detectors))
+
+
+def with_declared_size(matches, prior, static, *, dynamic, degree):
+    """Matches whose detectors have the size of their static distortions that a prior without a mean declares.
+
+    As uncertainty of what they state, with which it is fitted. Also what is left of the prior, that the scatter of
+    exposures is found, and what is done about static distortions. Other priors, and those of plain images, stay.
+
+    Raises
+    ------
+    InputError
+        For static distortions that are to be held.
+    """
+    declared = isinstance(prior, Prior) and not prior.states_mean and prior.static_sigma is not None
+    if not declared or not matches.camera.has_focal_plane:
+        return matches, prior, static
+    if static == "hold":
+        raise InputError(
+            "static='hold' (--static hold) takes static distortions of detectors as exact, and the prior declares "
+            "their uncertainty (static_sigma, --static-sigma): leave one of them out"
+        )
+    degree, detectors = 3 if isinstance(degree, str) else degree, {}
+    for key, each in matches.camera.detectors.items():
+        known = basis.change_degree(each.static, max(degree, basis.degree_of(each.static.shape[1])))
+        sigma = np.where(np.arange(known.shape[1]) < 3, 0.0, np.full(known.shape, prior.static_sigma))
+        detectors[key] = replace(each, static=known, static_sigma=sigma, static_covariance=None)
+    matches = replace(matches, camera=replace(matches.camera, detectors=detectors))
+    return matches, None if dynamic == "detector" else Prior(None, sigma="evidence"), static and "prior"
 
 
 def in_camera(matches, camera):

@@ -26,7 +26,7 @@ from ..results.settings import Settings
 from ..runtime.guards.units import plain_numbers
 from . import minimisers, model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
-from .camera_fit import CameraFit, Sought, common_widths, held, with_errors_times
+from .camera_fit import CameraFit, Sought, common_widths, held, with_declared_size, with_errors_times
 from .checks.limits import ALIKE, MOST_NAMED
 from .choices import prior_widths
 from .choices.degree_choice import choose_degree
@@ -111,7 +111,9 @@ def solve(
         left out of the fit (`legdistort.solving.choices.degree_choice`). 3 if neither it nor a `model` is given.
     prior : Prior or dict, optional
         Static distortion; one, or by ``detector`` or exposure name. None: nothing is known of it. The null space of the
-        problem may then leave absolute positions undetermined (``gauge.unknown``), which is logged as a warning.
+        problem may then leave absolute positions undetermined (``gauge.unknown``), which is logged as a warning. With a
+        camera of several detectors it is of the focal plane, but ``Prior(None, static_sigma=...)`` is the size, or the
+        uncertainty, of the static distortion of every detector, which is then fitted with it.
     model : `~astropy.modeling.Model`, optional
         Form of the distortion of every exposure, undistorted -> detector pixels, instead of `degree` and `prior`:
         ``Identity(2) + (Mapping((0, 1, 0, 1)) | Legendre2D & Legendre2D)``, with a static part added if there is one.
@@ -249,7 +251,7 @@ def solve(
     """
     motion, terms = of_motion(motion, terms)
     matches = with_stated(matches, pose_sigma, layout, layout_sigma)
-    whole, (matches, prior, static) = matches, _of_detectors(matches, prior, layout, static, dynamic)
+    whole, (matches, prior, static) = matches, _of_detectors(matches, prior, layout, static, dynamic, degree)
     sought, prior = _of_camera(matches, prior, model, degree, layout, static, exposure_degree)
     asked = SolveOptions(
         degree=degree, prior=prior, model=model, static=static, layout=layout, layout_sigma=layout_sigma,
@@ -305,9 +307,10 @@ def solution_of(fit, asked, **settings):
     return _solution(fit, 1.0, replace(_settings(asked, asked, None), **settings), found)
 
 
-def _of_detectors(matches, prior, layout, static, dynamic):
+def _of_detectors(matches, prior, layout, static, dynamic, degree):
     """The matches, of single detectors if they are asked for, what is known of these, and what to do about statics."""
     check_detectors(matches.camera.has_focal_plane, layout, static, dynamic)
+    matches, prior, static = with_declared_size(matches, prior, static, dynamic=dynamic, degree=degree)
     if dynamic == "detector" and matches.pose_sigma is not None:
         raise InputError(
             "pose_sigma is for whole exposures, and with dynamic='detector' every detector has a pose: leave it out"

@@ -59,6 +59,7 @@ def detector(x, seed):
 def camera():
     common = np.concatenate([np.zeros((2, 3)), np.full((2, 7), 0.05)], axis=1)
     known = {"common_map": 1e-3 * (common == 0), "header_map": [[1.0, -0.01, 3.0], [0.01, 1.0, -4.0]]}
+    known["place_errors"] = [[0.1, 0.2, 0.003], [0.2, 0.1, 0.004]]
     return Camera("pair", {"a": detector(10.0, 1), "b": detector(325.0, 2)}, FIELD, common, **known)
 
 
@@ -175,6 +176,7 @@ ANEW = {"table": "has other positions", "observations": "are those of the table"
 PLACES = {
     "detectors": "lie where the exposures show them",
     "common_sigma": "counts what was fitted",
+    "place_errors": "are those of places found anew",
     "header_map": "has the focal plane where the exposures show it",
 }
 

@@ -68,6 +68,8 @@ class CameraErrors:
         of the detectors of a camera.
     numbers : ndarray, shape (m, r), or None
         Of the numbers of terms, in the order of `Diagnostics.terms`.
+    unsettled : float
+        Largest change of the camera by the last step, in its errors, where it did not settle; 0 where it did.
     """
 
     free: np.ndarray = field(metadata=array("n_parts", 2, "modes", holds="booleans"))
@@ -80,6 +82,7 @@ class CameraErrors:
     departure: Departure | None = None
     owner: np.ndarray | None = field(default=None, metadata=array("n_exposures", holds="integers"))
     numbers: np.ndarray | None = field(default=None, metadata=array("n_numbers", "r"))
+    unsettled: float = field(default=0.0, metadata=number(minimum=0))
 
     @classmethod
     def nothing(cls, n_parts: int, n_exposures: int, n_stars: int, size: int) -> CameraErrors:

@@ -39,6 +39,10 @@ _NEARER = (
     "a layout that is nearer, by better headers or a camera file (--camera), if these dithers are larger than the "
     f"gaps: stars are looked for to {REACH:.0f} px and {np.degrees(TURNS[-1]):.0f} degree from where it has them"
 )
+_SETTLING = (
+    "the size of the static distortions of the detectors, --static-sigma PIXELS, in place of --prior; or more stars "
+    "that dithers carry from one detector to the others"
+)
 _TELL = "dithers larger than the gaps, which carry stars from one detector to the others, test it"
 
 
@@ -76,7 +80,18 @@ def camera_check(solution, residuals, observed, *, camera, contradicted, error, 
     given = _held(held, solution.camera.name, residuals, observed, error, judged)
     if contradicted is not None:
         given = contradicted if given is None else replace(contradicted, tests=given.tests)
-    return as_one([apart, given, stated, headers])
+    return as_one([_unsettled(solution, camera), apart, given, stated, headers])
+
+
+def _unsettled(solution, camera):
+    """The check of a fit of the camera that did not settle; None for one that did."""
+    if camera is None or not camera.unsettled:
+        return None
+    words = (
+        f"the detectors of camera {solution.camera.name} did not settle (the last step was {camera.unsettled:.2g} of "
+        "their errors): places, static distortions and positions may be wrong by far more than their errors"
+    )
+    return Check("camera", "fail", camera.unsettled, None, words, _SETTLING)
 
 
 def _few(solution, found):
