@@ -18,10 +18,11 @@ from ..inputs import column_contract
 from ..inputs.detector_files import warn_of_detectors
 from ..inputs.star_lists.formats import stack
 from ..inputs.table_files import named_after, named_as_known, names_of_images, records, told_apart, write_stars
-from ..priors.prior import EVIDENCE, HEADER, UNSTATED, HeaderPrior
+from ..priors.prior import EVIDENCE, HEADER, HeaderPrior
 from ..results.check import WRONG, Check, worst
 from ..runtime import outputs, parallel, provenance
 from ..runtime.trees.codec import from_tree
+from ..runtime.words import UNSTATED
 from ..solving.choices.degree_choice import AUTO, HIGHEST
 from ..solving.options import DEGREE
 from . import options

@@ -19,6 +19,7 @@ from ..geometry.tabulated.displacement_table import DisplacementTable
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees.facts import SIZE, array, number
+from ..runtime.words import UNSTATED
 from .mode_tables import mode_table
 
 if TYPE_CHECKING:
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
 EVIDENCE = "evidence"
 #: As `prior` of `legdistort.run`: that of the headers of the frames.
 HEADER = "header"
-#: Source of a mean whose source is not stated.
-UNSTATED = "unstated"
 _WIDTHS = array(2, "n_modes", unit="pix", minimum=0, infinite=True, choices=(EVIDENCE,))
 
 

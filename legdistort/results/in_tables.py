@@ -14,6 +14,7 @@ from ..exceptions import by_reason, some_of
 from ..geometry import basis
 from ..geometry.epochs import year
 from ..inputs import column_contract
+from ..runtime.words import UNSTATED
 from . import accuracy, new_positions, nights
 from . import motions as star_motions
 from .check import in_lines
@@ -348,8 +349,9 @@ def layout_errors(solution):
     if common is not None:  # infinite where exposures take over what detectors have in common
         orders = np.add(*basis.orders(basis.degree_of(common.shape[1])))
         degree = orders[np.isinf(common).any(axis=0)].max(initial=1)
-    if places.exchanges_a_bend(camera) and solution.gauge.tie is None and solution.gauge.static == "none":
-        degree = max(degree, solution.degree)
+    known = solution.settings.prior
+    if places.exchanges_a_bend(camera) and solution.gauge.tie is None and known and known.get("source") == UNSTATED:
+        degree = max(degree, solution.degree)  # nothing is known of what exposures scatter about
     which = "one affine map" if degree < 2 else f"one map of degree {degree}"
     unknown = f", and {solution.gauge.unknown_in_words}" if solution.gauge.unknown_names else ""
     bend = ""

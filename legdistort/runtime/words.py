@@ -47,6 +47,8 @@ KERNELS = ("square", "turbo", "point")  # of drizzle, those that conserve flux
 CONSERVE = ("flux", "surface_brightness")
 WEIGHTS = ("noise", "variance", "exptime", "seeing", "sigma_map")
 SCALES = ("auto", "exptime", "stars")
+#: Source of the mean of a prior whose source is not stated.
+UNSTATED = "unstated"
 #: What a file can have beside the image, and the attribute of a mosaic that each is.
 PLANES = {
     "UNCERT": "variance", "MASK": "mask", "WEIGHT": "weight", "FOOTPRINT": "footprint", "FLAGS": "flags",

@@ -17,13 +17,14 @@ from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, Solve
 from ..geometry import basis
 from ..matching.header_poses import header_map_by, sky_by_layout
 from ..matching.matches import Matches
-from ..priors.prior import UNSTATED, Prior, has_distortion
+from ..priors.prior import Prior, has_distortion
 from ..results.diagnostics import Diagnostics
 from ..results.errors.common_distortion import with_common_map
 from ..results.gauge import warning_of
 from ..results.in_tables import goodness
 from ..results.settings import Settings
 from ..runtime.guards.units import plain_numbers
+from ..runtime.words import UNSTATED
 from . import minimisers, model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought, common_widths, held, with_declared_size, with_errors_times

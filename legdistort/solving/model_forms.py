@@ -14,7 +14,8 @@ from ..exceptions import FoldError, InputError
 from ..geometry import basis, fitter, similarity
 from ..geometry.distortion import Distortion
 from ..geometry.models import FastLegendre2D, leaves, rebuilt, with_table
-from ..priors.prior import UNSTATED, Prior
+from ..priors.prior import Prior
+from ..runtime.words import UNSTATED
 
 #: A form must be a polynomial to this, pixels.
 _EXACT = 1e-8
