@@ -105,6 +105,23 @@ def test_stars_and_exposures_hold_the_map_of_motions_by_their_weights(single, mo
         assert least * free < held < most * free
 
 
+def test_a_star_that_two_epochs_have_move_unlike_all_others_is_named():
+    """One of its positions is that of another star, and no third one tells."""
+    nights = Nights(2, nights=4, per=2, n_stars=60, motion=0.3, roll=0.7)
+    table, states = nights.table, []
+    for wrong in (0.0, 25.0):
+        star = table[table["exposure"] == "n3e0"]["star"][5]
+        rows = table[~((table["star"] == star) & np.isin(table["block"], [1, 2]))]
+        rows["x"][(rows["star"] == star) & (rows["block"] == 3)] += wrong
+        solution = solve(Matches.from_table(rows, shape=(SIZE, SIZE)), motion="proper", clip=None)
+        assert solution.stars["n_epochs"][list(solution.stars["star"]).index(star)] == 2
+        states.append(next(check for check in solution.checks if check.name == "stars"))
+    assert [each.state for each in states] == ["pass", "warn"]
+    assert f"one star moves unlike all others, and nothing checks that, it was seen at two epochs only: {star} (" in (
+        states[1].sentence
+    )
+
+
 def test_rates_that_fixed_modes_cannot_take_back_are_found():
     """With all of degree 2 fixed at the truth, a drift of degree 2 of all stars shows in the residuals."""
     sim = field(60, np.repeat([2015.0, 2017.0, 2019.0], 4), degree=2, dynamic=0.0, zero_mean=False)
