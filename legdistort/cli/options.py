@@ -305,7 +305,7 @@ SOLVING = Group(
             "catalogue whose positions are known, a solution, or gaia: from its archive", metavar="TABLE", path="read"
         ),
         "reference_error": Option(
-            "of its positions where it states none, mas on the sky, else pixels; found: the size of all its errors",
+            "of its positions where it states none, mas, else pixels; found: their size is found, whatever it states",
             type=word_or(float, "found"),
             metavar="MAS",
         ),
