@@ -241,6 +241,16 @@ def widths_alone(detector, n):
     return np.where(np.arange(n) < 3, np.maximum(layout, static), static)
 
 
+def moved_by(detector, q, changes):
+    """How changes (2, n_modes, k) of the modes of a detector move what it measured, in the focal plane, (n, 2, k).
+
+    Modes of orders 0 and 1 are its layout, which moves the static distortion along. `q` (n, 2) are undistorted pixels.
+    """
+    values = basis.values(basis.degree_of(changes.shape[1]), *basis.normalize(q, detector.shape))
+    low, high = (np.einsum("amk,mn->nak", changes[:, part], values[part]) for part in (slice(0, 3), slice(3, None)))
+    return -np.linalg.inv(detector.layout[:, :2]) @ (low + np.linalg.inv(detector.distortion.jacobian(q)) @ high)
+
+
 def _affine(value, name):
     """An affine map (2, 3)."""
     out = np.array(value, dtype=float)

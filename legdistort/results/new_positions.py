@@ -329,11 +329,24 @@ def _parts(solution, table):
     exposures = np.asarray(table["exposure"]).astype(str)
     for name in dict.fromkeys(exposures.tolist()):
         rows = np.flatnonzero(exposures == name)
+        view = _of_exposure(solution, name)
         if not solution.camera.has_focal_plane:
-            yield solution[name], rows
+            yield view, rows
             continue
         detector = solution.camera.ids(table[rows])
         yield from ((solution[name, key], rows[detector == key]) for key in dict.fromkeys(detector.tolist()))
+
+
+def _of_exposure(solution, name):
+    """The view of an exposure; of another one the message says what corrects its positions."""
+    try:
+        return solution[name]
+    except InputError as error:
+        by = "its file by legdistort nights SOLUTION --out camera.asdf, then legdistort correct camera.asdf LIST"
+        by = "solution.camera.correct_table(list)" if solution.camera.has_focal_plane else by
+        raise InputError(
+            f"{error}; positions of other exposures are corrected for the static distortion alone, by a camera: {by}"
+        ) from None
 
 
 def _is_off(view, rows):

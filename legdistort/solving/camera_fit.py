@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..cameras.detector import affine_of
+from ..cameras.detector import affine_of, moved_by
 from ..cameras.stated_errors import resized
 from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, LegdistortError, SolveError, warn
 from ..geometry import basis, similarity
-from ..results.errors.camera_errors import CameraErrors, Departure, moved_by, unit_errors
+from ..results.errors.camera_errors import CameraErrors, Departure, unit_errors
 from ..results.new_positions import widened_all
 from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA
