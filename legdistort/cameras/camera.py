@@ -267,9 +267,14 @@ class Camera(ShownAsPrinted):
         ------
         InputError
             For a list that lacks columns or has bad values, a detector that the camera does not have, positions off
-            their detector by more than a pixel, or images without a static distortion.
+            their detector by more than a tenth of its size, or images without a static distortion.
         FoldError
             If a static distortion folds.
+
+        Warns
+        -----
+        AssumptionWarning
+            Of positions off their detector by more than a pixel, where the correction is extrapolated.
         """
         return static_correction.correct_table(self, table, sigma)
 

@@ -11,15 +11,15 @@ from dataclasses import replace
 import numpy as np
 from astropy import units as u
 
-from ..exceptions import InputError, some_of
+from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry import basis, detector_modes, similarity
 from ..geometry.distortion import Distortion
 from ..inputs import column_contract
 from .detector import moved_by
 from .stated_errors import FREE, StaticSpread, as_widths
 
-#: So far beyond its edge [pix] a position may lie on a detector: stars at an edge are fitted beyond it.
-_BEYOND = 1.0
+#: Beyond its edge by more [pix] a position is off a detector, and by this part of a side the series means nothing.
+_BEYOND, _FAR = 1.0, 0.1
 #: Positions that a message names.
 _MOST_NAMED = 3
 
@@ -56,18 +56,23 @@ def _detectors(camera, table):
 
 
 def _check_on_detectors(camera, xy, detector):
-    """Raise `InputError` for positions (n, 2) off their detectors."""
+    """Warn of positions (n, 2) off their detectors, as stars at an edge have them; `InputError` for those far off."""
     size = np.array([camera[key].shape[::-1] for key in detector])
-    off = np.flatnonzero(np.any((xy < -0.5 - _BEYOND) | (xy > size - 0.5 + _BEYOND), axis=1))
-    if len(off):
-        nx, ny = size[off[0]]
-        named = [f"row {k}, ({xy[k, 0]:.1f}, {xy[k, 1]:.1f})" for k in off]
-        on = f"detector {detector[off[0]]} of {nx} x {ny} px" if len(camera.detectors) > 1 else f"{nx} x {ny} px"
+    beyond = np.maximum(-0.5 - xy, xy - (size - 0.5))
+    if not len(off := np.flatnonzero(np.any(beyond > _BEYOND, axis=1))):
+        return
+    far = np.flatnonzero(np.any(beyond > _FAR * size, axis=1))
+    named = [f"row {k}, ({xy[k, 0]:.1f}, {xy[k, 1]:.1f})" for k in (far if len(far) else off)]
+    nx, ny = size[far[0] if len(far) else off[0]]
+    which = f", detector {detector[far[0] if len(far) else off[0]]}" * (len(camera.detectors) > 1)
+    said = f"{len(off)} of {len(xy)} positions of the list lie off camera {camera.name}{which}, {nx} x {ny} px: "
+    said += some_of(named, _MOST_NAMED)
+    if len(far):
         raise InputError(
-            f"{len(off)} of {len(xy)} positions of the list lie off camera {camera.name}, {on}: "
-            f"{some_of(named, _MOST_NAMED)}; is it the list of another detector, of binned pixels, or of a mosaic? "
-            "Leave these rows out, or give the camera of the list"
+            f"{said}; is it the list of another detector, of binned pixels, or of a mosaic? Give the camera of the "
+            "list, or leave these rows out"
         )
+    warn(f"{said}; the correction is extrapolated there", AssumptionWarning)
 
 
 def _corrected(camera, detector, xy, measured, sigma, rest):

@@ -182,6 +182,7 @@ class Solution(ShownAsPrinted):
         (p < 0.001 over the number of nights, and three times as far), and the rest is compared without it; none is
         where there are no two others. Of two nights p is that of no departure at all. Without others, and where
         exposures have no distortion of their own, there is no departure (NaN, ``dof`` 0). ``exposures``: their names.
+        `print` shows the columns that tell how a night differs; ``pprint_all()`` shows all.
         """
         return nights.table(self)
 

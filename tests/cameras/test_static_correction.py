@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import legdistort as ld
 from legdistort.cli.parser import main
-from legdistort.exceptions import FoldError, InputError
+from legdistort.exceptions import AssumptionWarning, FoldError, InputError
 from legdistort.geometry.tabulated.displacement_table import DisplacementTable
 
 SHAPE = (900, 1200)
@@ -192,13 +192,19 @@ def test_a_prior_has_the_scatter_of_exposures():
 # -- bad lists
 
 
-def test_off_the_detector_by_more_than_a_pixel():
-    xy = np.array([[-1.4, 5.0], [1200.4, 900.4]])
-    camera().correct_table(listed(xy))
-    with pytest.raises(InputError, match=r"1 of 2 positions .* off camera one, 1200 x 900 px: row 1, \(1200.6, 4.0\)"):
-        camera().correct_table(listed(np.array([[1.0, 1.0], [1200.6, 4.0]])))
-    with pytest.raises(InputError, match="detector b of 1200 x 900 px"):
-        pair().correct_table(listed(np.array([[1300.0, 1.0]]), detector=["b"]))
+def test_off_the_detector():
+    """A pixel beyond an edge is rounding, a few are stars at the edge, and more is another detector."""
+    camera().correct_table(listed(np.array([[-1.4, 5.0], [1200.4, 900.4]])))
+    near = np.array([[1.0, 1.0], [1200.6, 4.0]])
+    words = (
+        r"1 of 2 positions of the list lie off camera one, 1200 x 900 px: row 1, \(1200.6, 4.0\); the correction is ext"
+    )
+    with pytest.warns(AssumptionWarning, match=words):
+        camera().correct_table(listed(near))
+    with pytest.raises(InputError, match=r"3 of 3 .* off camera one, 1200 x 900 px: row 2, \(5.0, 1000.0\); is it the"):
+        camera().correct_table(listed(np.array([[-3.0, 1.0], [1200.6, 4.0], [5.0, 1000.0]])))
+    with pytest.raises(InputError, match="off camera pair, detector b, 1200 x 900 px"):
+        pair().correct_table(listed(np.array([[1400.0, 1.0]]), detector=["b"]))
 
 
 @pytest.mark.parametrize(
