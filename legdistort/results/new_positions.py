@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from astropy import units as u
+from scipy.spatial import cKDTree
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry import basis, similarity
@@ -23,6 +24,8 @@ from ..inputs import column_contract
 from .errors import absolute_errors, common_maps
 from .motions import fitted
 
+#: Positions that agree to this [pix] are one, as tables with rounded numbers have it; exposures are this far apart.
+_SAME, _APART = 1e-3, 1e6
 #: Positions that a warning names.
 _MOST_NAMED = 3
 
@@ -314,6 +317,8 @@ def correct_table(solution, table, epoch=None):
         off[rows] = _is_off(view, table[rows])
     _warn_of_extrapolation(table, np.flatnonzero(off))
     out = table.copy()
+    if "star" not in out.colnames:
+        out["star"] = _stars_of(solution, table, pixels)
     out["x"], out["y"] = xy.T * u.pix
     out["x_err_abs"], out["y_err_abs"] = np.sqrt(np.einsum("nkk->kn", absolute)) * u.pix
     column_contract.set_covariance(out, relative)
@@ -322,6 +327,23 @@ def correct_table(solution, table, epoch=None):
     if epoch is not None:
         out.meta["epoch"] = year(epoch)
     return column_contract.describe_stars(out)
+
+
+def _stars_of(solution, table, pixels):
+    """Star of the solution that has the same position of the same exposure, (n,); -1, or an empty text, for none."""
+    known, names = solution.residuals, np.array(solution.names)
+
+    def points(exposures, xy):  # exposures are far apart in one more dimension
+        order = np.argsort(names)
+        number = order[np.searchsorted(names[order], np.asarray(exposures).astype(str))]
+        return np.column_stack([number * _APART, xy])
+
+    seen = points(known["exposure"], np.column_stack([known[name].to_value(u.pix) for name in "xy"]))
+    distance, row = cKDTree(seen).query(points(table["exposure"], pixels), distance_upper_bound=_SAME)
+    star, found = np.asarray(known["star"]), np.isfinite(distance)
+    out = np.full(len(found), "" if star.dtype.kind == "U" else -1, dtype=star.dtype)
+    out[found] = star[row[found]]
+    return out
 
 
 def _parts(solution, table):
