@@ -245,6 +245,7 @@ def run(
         check_results(out, overwrite)  # again: nobody else writes there any more
         with timed(timings, "read"):
             exposures, bad = _open_frames(paths, min_exposures, stop_at_bad, progress, reference is not None, **reading)
+            exposures = before.named(exposures) if before else exposures
             solving = _known_of(exposures, solving, prior, reading["camera"])
             stated_numbers({whole_name(e): e.header for e in exposures}, matching.keywords)  # refuses what none states
         with timed(timings, "measure"):
