@@ -232,14 +232,12 @@ def do_prior(a):
     prior, of_several = given_prior(a)
     prior.write(a.out, overwrite=a.overwrite)
     rms_x, rms_y = rms = prior.rms.tolist()
-    figures = {
-        "degree": prior.degree,
-        "truncation_px": prior.truncation,
-        "rms_px": rms,
-        "shape": prior.shape, "source": prior.source,
-    }  # fmt: skip
+    figures = {"degree": prior.degree, "truncation_px": prior.truncation, "rms_px": rms}
+    figures |= {"shape": prior.shape, "source": prior.source}
     words = f"degree {prior.degree}{' and a table' * (prior.table is not None)}, truncation error"
     words += f" {prior.truncation:.2g} px; the distortion is {rms_x:.3g} px rms in x, {rms_y:.3g} in y"
+    if (told := (prior.source if isinstance(prior.source, dict) else {}).get("common_map_px")) is not None:
+        words += f", with the map of the focal plane that a reference told ({told:.3g} px rms per axis)"
     _say(a, "; ".join(filter(None, [words, of_several, str(a.out)])), figures)
 
 

@@ -301,3 +301,51 @@ def test_what_is_refused(words, said, folder, capsys, monkeypatch, tmp_path):
     assert main(["correct", *words.split(), "--out", str(tmp_path / "out.ecsv")]) == 1
     assert said in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+# -- one detector of a camera whose focal plane has a map that a reference told
+
+
+def told(**known):
+    common = np.zeros((2, 10))
+    common[:, 3:] = np.random.default_rng(7).normal(0, 1.0, (2, 7))
+    return pair(common_map=common, common_sigma=np.full((2, 10), 0.02), **known)
+
+
+def test_a_prior_of_one_detector_has_the_common_map(tmp_path, capsys):
+    """Pixels of the detector after one similarity, by numpy, but for products of both maps; the command says so."""
+    whole = told()
+    whole.write(tmp_path / "told.asdf")
+    words = ["prior", str(tmp_path / "told.asdf"), "--ext", "b", "--out", str(tmp_path / "prior.asdf")]
+    assert main(words) == 0
+    rms = np.sqrt(np.mean(np.sum(whole.common_map**2, axis=1)) / 4)
+    assert (
+        f"with the map of the focal plane that a reference told ({rms:.3g} px rms per axis)" in capsys.readouterr().out
+    )
+    prior = ld.Prior.read(tmp_path / "prior.asdf")
+    f = (places(300) - TURNED[:, 2]) @ np.linalg.inv(TURNED[:, :2]).T
+    there = distort(f, whole.common_map, whole.field) @ whole["b"].layout[:, :2].T + whole["b"].layout[:, 2]
+    seen = distort(there, whole["b"].static)
+    design = np.stack([f @ [1, 1j], np.ones(len(f))], axis=1)
+    without = ld.Prior(whole["b"].static, shape=SHAPE)
+    off = [xy_of(each.correct_table(listed(seen))) @ [1, 1j] for each in (prior, without)]
+    off = [np.abs(design @ np.linalg.lstsq(design, w, rcond=None)[0] - w).max() for w in off]
+    assert off[0] < 0.02
+    assert off[1] > 0.5
+
+
+def test_its_errors_are_those_of_both(tmp_path):
+    """The common map stepped by its errors, one mode after the other."""
+    whole, free = told(), pair()
+    free.write(tmp_path / "free.asdf")
+    whole.write(tmp_path / "told.asdf")
+    prior, alone = (ld.Prior.from_file(tmp_path / f"{name}.asdf", ext="a") for name in ("told", "free"))
+    steps = []
+    for axis, mode in np.ndindex(2, 10):
+        moved = whole.common_map.copy()
+        moved[axis, mode] += 0.02
+        other = ld.Camera("pair", whole.detectors, field=whole.field, common_map=moved, common_sigma=whole.common_sigma)
+        other.write(tmp_path / "moved.asdf", overwrite=True)
+        steps.append((ld.Prior.from_file(tmp_path / "moved.asdf", ext="a").mean - prior.mean)[:, 3:].ravel())
+    expected = np.sum(np.square(steps), axis=0) + alone.static_sigma[:, 3:].ravel() ** 2
+    assert_allclose(prior.static_sigma[:, 3:].ravel(), np.sqrt(expected), rtol=0.02)
