@@ -244,7 +244,7 @@ def run(
     with outputs.replacing_folder(out := Path(out), results=RESULTS, keep=keep) as target:
         check_results(out, overwrite)  # again: nobody else writes there any more
         with timed(timings, "read"):
-            exposures, bad = _open_frames(paths, min_exposures, stop_at_bad, progress, reference is not None, **reading)
+            exposures, bad = _open_frames(paths, before, min_exposures, stop_at_bad, progress, reference, **reading)
             solving = _known_of(exposures, solving, prior, reading["camera"])
             stated_numbers({whole_name(e): e.header for e in exposures}, matching.keywords)  # refuses what none states
         with timed(timings, "measure"):
@@ -342,13 +342,14 @@ def _of_start():
     return {} if since is None else {"start": time.perf_counter() - since}
 
 
-def _open_frames(paths, min_exposures, stop_at_bad, progress, tied, *, camera, **reading):
-    """Exposures that can be solved together, and the bad ones as ``{name: reason}``."""
+def _open_frames(paths, before, min_exposures, stop_at_bad, progress, reference, *, camera, **reading):
+    """Exposures that can be solved together, called as `before`, and the bad ones as ``{name: reason}``."""
     bad = {}
     options = {"left_out": bad, "stop_at_bad": stop_at_bad, "progress": progress}
     exposures = exposure_files.open_exposures(paths, **options, **reading)
     exposures = camera.of_detectors(exposures) if camera else exposures
-    _check_exposures(exposures, min_exposures, bad, tied)
+    exposures = before.named(exposures) if before else exposures
+    _check_exposures(exposures, min_exposures, bad, reference is not None)
     return exposures, bad
 
 

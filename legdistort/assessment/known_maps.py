@@ -7,12 +7,11 @@ from astropy import units as u
 from scipy import special
 
 from ..cameras.camera import Camera
-from ..cameras.detector import map_alone, widths_alone
-from ..cameras.places import common_modes, whole_map
+from ..cameras.detector import map_alone, maps_of_plane, widths_alone
 from ..cameras.stated_errors import FREE
 from ..exceptions import InputError
 from ..geometry import basis, detector_modes
-from ..geometry.similarity import apply, invert
+from ..geometry.distortion import Distortion
 from ..matching.matches import Matches
 from ..priors.prior import Prior
 from ..results.errors.common_distortion import NOTHING, common_distortion
@@ -122,7 +121,8 @@ def _of_camera(camera, label, common=None):
         n = camera.common_map.shape[1]
         common, sigma = camera.common_map, np.minimum(camera.common_sigma.ravel(), NOTHING)
     if n and common is not None:
-        statics = {key: _whole(camera, each, common[:, :n]) for key, each in camera.detectors.items()}
+        plane = Distortion(common[:, :n], camera.field)
+        statics = {key: map_alone(each, plane)[1] for key, each in camera.detectors.items()}
     shapes = {key: each.shape for key, each in camera.detectors.items()}
     widths, covariance = [each.static_sigma for each in camera.detectors.values()], None
     if not camera.has_focal_plane:
@@ -132,7 +132,7 @@ def _of_camera(camera, label, common=None):
         widths = [widths_alone(each, statics[key].shape[1]) for key, each in camera.detectors.items()]
         covariance = np.diag(np.concatenate([np.minimum(each.ravel(), NOTHING) ** 2 for each in widths]))
         if n:
-            maps = [common_modes(camera, each, n).reshape(2, n, -1) for each in camera.detectors.values()]
+            maps = [maps_of_plane(each, camera.field, n).reshape(2, n, -1) for each in camera.detectors.values()]
             whole = [np.pad(each, ((0, 0), (0, max(w.shape[1] - n, 0)), (0, 0)))[:, : w.shape[1]]
                      for each, w in zip(maps, widths, strict=True)]  # fmt: skip
             shared = np.concatenate([each.reshape(-1, 2 * n) for each in whole])
@@ -163,7 +163,7 @@ def _of_focal_plane(solution, label):
     known = _of_camera(camera, label)
     n = int(np.flatnonzero(errors.free.any(axis=(0, 1))).max()) + 1  # what is beyond was given, and not asked
     free = errors.free[:, :, :n]
-    common = np.concatenate([common_modes(camera, each, n) for each in camera.detectors.values()])
+    common = np.concatenate([maps_of_plane(each, camera.field, n) for each in camera.detectors.values()])
     mean, covariance, shared = common_distortion(solution, n)
     moved = common @ shared
     moved[free.ravel()] += errors.changes
@@ -172,14 +172,12 @@ def _of_focal_plane(solution, label):
                          for each in camera.detectors.values()]  # fmt: skip
     covariance = common @ covariance @ common.T + moved @ moved.T + np.diag(NOTHING**2 * unseen.ravel())
     degree, common = basis.degree_of(n), mean.reshape(2, n)
-    statics = {key: pointed(_whole(camera, each, common), each.shape) for key, each in camera.detectors.items()}
+    plane = Distortion(common, camera.field)
+    statics = {
+        key: detector_modes.pointed(map_alone(each, plane)[1], each.shape) for key, each in camera.detectors.items()
+    }
     statics = {key: basis.change_degree(each, degree) for key, each in statics.items()}
     return replace(known, statics=statics, covariance=covariance, degree=degree, common=common)
-
-
-def _whole(camera, detector, common):
-    """Coefficients of all that displaces on a detector, with a `common` distortion (2, n) of the focal plane."""
-    return whole_map(camera, detector, common, map_alone(detector)[0])
 
 
 def _of_night(solution, label, other):
@@ -245,7 +243,7 @@ def shown_by(solution, label, other=None, numbers=None):
         )
     degree, n = solution.degree, basis.n_modes(solution.degree)
     around = solution.coefficients[:, :, :n].mean(axis=0) if other is None else basis.change_degree(other, degree)
-    around, rows = pointed(around, shape), detector_modes.dynamic_basis(shape, n)
+    around, rows = detector_modes.pointed(around, shape), detector_modes.dynamic_basis(shape, n)
     kept, fit = {name: getattr(solution.settings, name) for name in _KEPT}, None
     for _ in range(_ROUNDS):
         options = SolveOptions(degree=degree, prior=Prior(around, shape=shape), clip=None, **kept)
@@ -344,18 +342,3 @@ def _freedom(posterior):
     width, label = posterior.widths, posterior.factor.size
     left = (np.eye(len(width)) - posterior.of_rows / width / width[:, None]) ** 2
     return np.array([left[np.ix_(label == j, label == j)].sum() for j in range(len(posterior.sizes))])
-
-
-def pointed(static, shape):
-    """Coefficients of the same map after a similarity, as a pose has it, so that they have no part of one."""
-    degree = basis.degree_of(static.shape[1])
-    for _ in range(_ROUNDS):
-        back = invert(detector_modes.similarity_part(static, shape))
-
-        def displacement(u, v, static=static, back=back):
-            there = basis.denormalize(u, v, shape)
-            q = apply(back, there)
-            return (q - there).T + static @ basis.values(degree, *basis.normalize(q, shape))
-
-        static = basis.project(displacement, degree)
-    return static

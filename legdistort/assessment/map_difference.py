@@ -26,7 +26,7 @@ from ..runtime.asdf_files import entry_of
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from .camera_memory import CombinedNights
-from .known_maps import DETERMINED, MEAN_SQUARE, chance, known_map, pointed
+from .known_maps import DETERMINED, MEAN_SQUARE, chance, known_map
 from .night_data import numbers_in
 from .star_difference import StarDifference, compare_stars, shared_exposures
 
@@ -300,7 +300,10 @@ def _of_maps(one, two):
     for mine, theirs in pairs:
         shape = one.shapes[mine] or two.shapes[theirs]
         rows.append(detector_modes.dynamic_basis(shape, n))
-        maps = [basis.change_degree(pointed(each, shape), degree) for each in (one.statics[mine], two.statics[theirs])]
+        maps = [
+            basis.change_degree(detector_modes.pointed(each, shape), degree)
+            for each in (one.statics[mine], two.statics[theirs])
+        ]
         values.append(rows[-1] @ (maps[1] - maps[0]).ravel())
     known = [_in_rows(each, [pair[k] for pair in pairs], rows, n) for k, each in enumerate((one, two))]
     stated = any(each is not None for each in known)

@@ -15,7 +15,7 @@ from ..inputs.repetitions import fingerprints
 from ..priors.prior import Prior
 from ..results.solution import Solution
 from ..runtime.trees.facts import array, number
-from .known_maps import pointed, shown_by, sound
+from .known_maps import shown_by, sound
 
 #: Error of a coefficient [pix] of a map that states none: that of a header as `legdistort attach` writes it.
 EXACT = 1e-3
@@ -118,8 +118,9 @@ class Night:
         directions, variances = spread.directions[0], spread.variance[0]
         information = directions / (variances + EXACT**2) @ directions.T
         return cls(
-            name, date=None, n_exposures=1, n_stars=0, around=pointed(prior.mean, prior.shape), n_nights=1,
-            information=information, pull=np.zeros(len(rows)), scatter=np.zeros(degree), nightly=None, dof=np.inf,
+            name, date=None, n_exposures=1, n_stars=0, n_nights=1,
+            around=detector_modes.pointed(prior.mean, prior.shape), information=information,
+            pull=np.zeros(len(rows)), scatter=np.zeros(degree), nightly=None, dof=np.inf,
         )  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """Whether the stars of a solution are the stars of its frames: bright peaks that none explains, stars of halos.
 
-The co-added image decides, in which cosmic rays and what single frames have are gone.
+The co-added image decides, where cosmic rays and what single frames have are gone from it.
 """
 
 from dataclasses import dataclass
@@ -18,6 +18,8 @@ _OWN, _RING = 1.0, 3.0
 _NEAR, _FAR = (1.0, 6.0), (12.0, 18.0)
 #: A star that much fainter may be part of the other.
 _FAINTER = 0.1
+#: Exposures among which what a single one has is told.
+_CLIPPED = 3
 _ROWS = 1024  # of the image that are looked at at a time
 
 
@@ -85,7 +87,7 @@ def unexplained_light(mosaic, solution, *, fwhm):
     heights, covered = _heights(mosaic, xy, fwhm)
     if not np.isfinite(heights).any():
         return UnexplainedLight(0, 0, len(stars), n_around, by_chance)
-    fewest = np.quantile(covered[np.isfinite(heights)], 0.1)
+    fewest = max(np.quantile(covered[np.isfinite(heights)], 0.1), min(_CLIPPED, mosaic.footprint.max()))
     peaks = _peaks(mosaic, fwhm, np.nanmedian(heights), fewest)
     without = KDTree(xy).query(peaks)[0] > max(_OWN * fwhm, 2.0) if len(peaks) else np.zeros(0, dtype=bool)
     return UnexplainedLight(len(peaks), int(np.count_nonzero(without)), len(stars), n_around, by_chance)

@@ -31,7 +31,7 @@ from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees import codec
 from ..runtime.trees.facts import SIZE, array, keyed
 from . import places as found_places
-from . import storage
+from . import static_correction, storage
 from .detector import Detector, Place
 from .from_wcs import camera_of, fullest, header_map, moved_plane, stated_detectors
 from .header_layout import HeaderLayout, compare_headers
@@ -252,6 +252,47 @@ class Camera(ShownAsPrinted):
         table["x"], table["y"] = xy.T * u.pix
         column_contract.set_covariance(table, covariance)
         return table
+
+    @plain_numbers
+    def correct_table(self, table: Table, *, sigma: ArrayLike | None = None) -> QTable:
+        """Positions in any list of its detectors -> its focal plane, by the static distortion alone, with their errors.
+
+        A single detector has its undistorted pixels in the place of a focal plane. The pose of an exposure stays, and
+        what it adds to the static distortion: `Solution.correct_table` takes these off too.
+
+        Parameters
+        ----------
+        table : `~astropy.table.Table`
+            Columns ``x``, ``y`` [pix], and ``detector`` where there are several; ``x_err``, ``y_err`` and perhaps
+            ``xy_corr``, without which the errors are those of the correction alone.
+        sigma : array_like, optional
+            Scatter of exposures about the static distortion, as `sigma` of a `Prior`: over the focal plane of several
+            detectors. None leaves it out.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            Row by row: ``x``, ``y``; ``x_err``, ``y_err``, ``xy_corr`` by the measurement, the scatter of exposures
+            and what is stated of the detectors in a focal plane; ``x_err_abs``, ``y_err_abs`` with the map that all
+            exposures have in common, which is the static distortion of a single detector. NaN where that is not known;
+            what states no error counts as exact. Further columns are kept, of several detectors ``x_detector`` and
+            ``y_detector`` are the positions as given. In the ``meta`` are ``static_error_px`` and
+            ``exposure_scatter_px``, rms per axis over the positions.
+
+        Raises
+        ------
+        InputError
+            For a list that lacks columns or has bad values, a detector that the camera does not have, positions off
+            their detector by more than a tenth of its size, or images without a static distortion.
+        FoldError
+            If a static distortion folds.
+
+        Warns
+        -----
+        AssumptionWarning
+            Of positions off their detector by more than a pixel, where the correction is extrapolated.
+        """
+        return static_correction.correct_table(self, table, sigma)
 
     def on_detectors(self, table: QTable) -> QTable:
         """A table that `in_focal_plane` made, as it was before."""

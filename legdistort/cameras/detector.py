@@ -224,18 +224,40 @@ class Detector(ShownAsPrinted):
         return f"<Detector: {self.shape[1]} x {self.shape[0]} px, static distortion {self.rms:.3g} px rms>"
 
 
-def map_alone(detector):
-    """Similarity (2, 3) from the focal plane to a detector, and coefficients (2, n_modes) of the rest of its map."""
+def map_alone(detector, plane=None):
+    """Similarity (2, 3) from the focal plane to a detector, and coefficients (2, n_modes) of the rest of its map.
+
+    With a `Distortion` of the focal plane, `plane`, also what that makes of the rest.
+    """
     t = np.linspace(-1, 1, 9)
     q = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), detector.shape)
     pose = similarity.fit_similarity(similarity.apply(similarity.invert(detector.layout), q), q)
+    return pose, map_beside(detector, pose, plane)
+
+
+def map_beside(detector, pose, plane=None):
+    """Coefficients (2, n_modes) of what is left of the map of a detector beside a pose (2, 3), as `map_alone`."""
     back = similarity.invert(pose)
 
     def shift(u, v):
         place = basis.denormalize(u, v, detector.shape)
-        return (detector.to_pixels(similarity.apply(back, place)) - place).T
+        f = similarity.apply(back, place)
+        return (detector.to_pixels(f if plane is None else plane(f)) - place).T
 
-    return pose, basis.project(shift, max(basis.degree_of(detector.static.shape[1]), 1))
+    degree = max(basis.degree_of(detector.static.shape[1]), 1 if plane is None else plane.degree)
+    return basis.project(shift, degree)
+
+
+def maps_of_plane(detector, field, n):
+    """Coefficients (2 n, 2 n) on a detector of the modes of its focal plane, whose size is `field` (ny, nx)."""
+    degree, back = basis.degree_of(n), similarity.invert(detector.layout)
+
+    def modes(u, v):
+        there = similarity.apply(back, basis.denormalize(u, v, detector.shape))
+        return basis.values(degree, *basis.normalize(there, field))
+
+    alone = basis.project(modes, degree)
+    return np.einsum("ab,mk->akbm", detector.layout[:, :2], alone).reshape(2 * n, 2 * n)
 
 
 def widths_alone(detector, n):
@@ -243,6 +265,16 @@ def widths_alone(detector, n):
     given = [detector.layout_sigma, detector.static_sigma]
     layout, static = (np.zeros((2, n)) if w is None else basis.change_degree(w, basis.degree_of(n)) for w in given)
     return np.where(np.arange(n) < 3, np.maximum(layout, static), static)
+
+
+def moved_by(detector, q, changes):
+    """How changes (2, n_modes, k) of the modes of a detector move what it measured, in the focal plane, (n, 2, k).
+
+    Modes of orders 0 and 1 are its layout, which moves the static distortion along. `q` (n, 2) are undistorted pixels.
+    """
+    values = basis.values(basis.degree_of(changes.shape[1]), *basis.normalize(q, detector.shape))
+    low, high = (np.einsum("amk,mn->nak", changes[:, part], values[part]) for part in (slice(0, 3), slice(3, None)))
+    return -np.linalg.inv(detector.layout[:, :2]) @ (low + np.linalg.inv(detector.distortion.jacobian(q)) @ high)
 
 
 def _affine(value, name):

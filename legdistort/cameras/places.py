@@ -9,47 +9,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..geometry import basis, similarity
-from .detector import Detector
-
-
-def whole_map(camera, detector, common, pose):
-    """Coefficients (2, n_modes) of all that displaces on a detector, beside a pose (2, 3) from the focal plane to it.
-
-    Parameters
-    ----------
-    camera : Camera
-    detector : Detector
-    common : ndarray, shape (2, n)
-        Distortion of the focal plane.
-    pose : ndarray, shape (2, 3)
-    """
-    degree, back = basis.degree_of(max(detector.static.shape[1], common.shape[1])), similarity.invert(pose)
-
-    def displacement(u, v):
-        q = basis.denormalize(u, v, detector.shape)
-        f = similarity.apply(back, q)
-        modes = basis.values(basis.degree_of(common.shape[1]), *basis.normalize(f, camera.field))
-        return (detector.to_pixels(f + (common @ modes).T) - q).T
-
-    return basis.project(displacement, max(degree, 1))
-
-
-def common_modes(camera, detector, n):
-    """Coefficients (2 n, 2 n) on a detector of n modes per axis of the focal plane."""
-    degree, back = basis.degree_of(n), similarity.invert(detector.layout)
-
-    def modes(u, v):
-        there = similarity.apply(back, basis.denormalize(u, v, detector.shape))
-        return basis.values(degree, *basis.normalize(there, camera.field))
-
-    alone = basis.project(modes, degree)
-    return np.einsum("ab,mk->akbm", detector.layout[:, :2], alone).reshape(2 * n, 2 * n)
+from ..geometry import basis
+from ..geometry.distortion import Distortion
+from .detector import Detector, map_beside, maps_of_plane
 
 
 def shifts_and_turns(camera, n):
     """Layout modes (6 n_detectors, 2 n) of all detectors, by the n modes per axis of a map of the focal plane."""
-    each = [common_modes(camera, detector, n) for detector in camera.detectors.values()]
+    each = [maps_of_plane(detector, camera.field, n) for detector in camera.detectors.values()]
     return np.concatenate([modes.reshape(2, n, 2 * n)[:, :3].reshape(6, 2 * n) for modes in each])
 
 
@@ -66,11 +33,9 @@ def places(camera):
         return {key: each.place for key, each in camera.detectors.items()}
     errors = camera.place_errors
     errors = relative_errors(camera, _independent(camera)) if errors is None else errors
-    out = {}
+    plane, out = Distortion(camera.common_map, camera.field), {}
     for (key, each), row in zip(camera.detectors.items(), errors, strict=True):
-        whole = Detector(
-            each.shape, layout=each.layout, static=whole_map(camera, each, camera.common_map, each.layout)
-        ).placed()
+        whole = Detector(each.shape, layout=each.layout, static=map_beside(each, each.layout, plane)).placed()
         out[key] = replace(whole.place, errors=tuple(row.tolist()))
     return out
 

@@ -40,6 +40,7 @@ from .given_files import (
     without_options_of_prior,
 )
 from .repeating import repeatable
+from .static_lists import given_static
 
 #: What belongs to a reference.
 _TYING = ("reference_error", "reference_degree", "epoch")
@@ -232,14 +233,12 @@ def do_prior(a):
     prior, of_several = given_prior(a)
     prior.write(a.out, overwrite=a.overwrite)
     rms_x, rms_y = rms = prior.rms.tolist()
-    figures = {
-        "degree": prior.degree,
-        "truncation_px": prior.truncation,
-        "rms_px": rms,
-        "shape": prior.shape, "source": prior.source,
-    }  # fmt: skip
+    figures = {"degree": prior.degree, "truncation_px": prior.truncation, "rms_px": rms}
+    figures |= {"shape": prior.shape, "source": prior.source}
     words = f"degree {prior.degree}{' and a table' * (prior.table is not None)}, truncation error"
     words += f" {prior.truncation:.2g} px; the distortion is {rms_x:.3g} px rms in x, {rms_y:.3g} in y"
+    if (told := (prior.source if isinstance(prior.source, dict) else {}).get("common_map_px")) is not None:
+        words += f", with the map of the focal plane that a reference told ({told:.3g} px rms per axis)"
     _say(a, "; ".join(filter(None, [words, of_several, str(a.out)])), figures)
 
 
@@ -401,11 +400,16 @@ def do_correct(a):
     """``legdistort correct``."""
     from ..inputs.table_files import write_by_ending
 
-    solution = _solution(a)
-    table = named_as_known(read_given(a.table, a), a.table, solution.names)
-    table = solution.correct_table(table, epoch=a.epoch)
+    if (static := given_static(a.solution, a)) is not None:
+        refuse({"epoch": a.epoch, "max_bytes": a.max_bytes}, "is for a solution")
+        table, said, figures = static.corrected(a)
+    else:
+        refuse({"detector": a.detector}, "is for the lists of a camera")
+        solution, said, figures = _solution(a), "", {}
+        lists = [named_as_known(read_given(path, a), path, solution.names) for path in a.tables]
+        table = solution.correct_table(stack(lists), epoch=a.epoch)
     write_by_ending(table, a.out, overwrite=a.overwrite)
-    _say(a, f"{len(table)} positions in {a.out}", {"n_positions": len(table), "out": str(a.out)})
+    _say(a, f"{len(table)} positions in {a.out}{said}", {"n_positions": len(table), "out": str(a.out)} | figures)
 
 
 def do_report(a):

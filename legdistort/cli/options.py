@@ -79,10 +79,7 @@ COLUMNS = {
     "origin": Option("of pixels in the table (default: the program's, else 0)", type=int, choices=(0, 1)),
     "error": Option("of positions that come without one", type=float, metavar="PIXELS"),
 }
-TABLE = {
-    **COLUMNS,
-    "shape": Option("of the detector, pixels", type=int, nargs=2, metavar=("NY", "NX")),
-}
+TABLE = {**COLUMNS, "shape": Option("of the detector, pixels", type=int, nargs=2, metavar=("NY", "NX"))}
 TABLES = {
     "tables": Option(
         "positions; without a column exposure, one exposure", "tables", nargs="+", metavar="TABLE", path="inputs"
@@ -92,7 +89,10 @@ WCS_OF_TABLES = {
     "wcs": Option("frames of the tables: WCS, shape and time", nargs="+", metavar="FRAME", path="inputs"),
     "ext": Option("extension of those frames: number, name, or NAME,VERSION", type=extension),
 }
-POSITIONS = {"table": Option("exposure, x, y, x_err, y_err", "table", metavar="TABLE", path="read")}
+OF_STATIC = {
+    "solution": Option("solution.asdf or its folder; or a camera, or what --prior takes", "solution", path="read"),
+    "detector": Option("of a camera, which took lists without a column detector", metavar="NAME"),
+}
 MATCHED = {
     "tables": Option(
         "exposure, star, x, y, x_err, y_err; several: fields of one camera without a common star, solved together",
@@ -102,9 +102,7 @@ MATCHED = {
         path="inputs",
     )
 }
-LEFT_OUT = {
-    "without": Option("exposures or nights to leave out, * for any letters", nargs="+", metavar="NAME"),
-}
+LEFT_OUT = {"without": Option("exposures or nights to leave out, * for any letters", nargs="+", metavar="NAME")}
 WORKERS = {"workers": Option("cores to use (default: all, where frames are not few and small)", type=int, metavar="N")}
 
 
@@ -305,7 +303,7 @@ SOLVING = Group(
             "catalogue whose positions are known, a solution, or gaia: from its archive", metavar="TABLE", path="read"
         ),
         "reference_error": Option(
-            "of its positions where it states none, mas on the sky, else pixels; found: the size of all its errors",
+            "of its positions where it states none, mas, else pixels; found: their size is found, whatever it states",
             type=word_or(float, "found"),
             metavar="MAS",
         ),

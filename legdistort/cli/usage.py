@@ -192,10 +192,10 @@ COMMANDS = {
         options.AT_EPOCH,
     ),
     "correct": _command(
-        "positions measured elsewhere in its exposures to the reference plane and the sky, with errors",
+        "positions in its exposures to the reference plane and the sky, or any lists by a camera alone, with errors",
         "results/solution.asdf faint.ecsv --out corrected.ecsv",
-        options.SOLUTION,
-        options.POSITIONS,
+        options.SOLUTION | options.OF_STATIC,
+        options.TABLES,
         options.out("table (.ecsv, .fits, .vot, .xml, .csv, .txt or .dat)"),
         options.COLUMNS,
         options.CARRIED,

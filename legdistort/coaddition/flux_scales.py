@@ -83,7 +83,7 @@ def _factors(frames, scale, views, areas):
             of_all = factors[place[:, 0]] * of_detectors[place[:, 1]]
             return of_all, "exptime, stars" if sensitive and len(detectors) > 1 else "exptime"
         log.info(
-            "the transparency changed: by exposure, stars have %.2f to %.2f of the light that exposure times tell; "
+            "transparency or gain changed: by exposure, stars have %.2f to %.2f of the light that exposure times tell; "
             "their fluxes, not times, bring exposures to one scale", np.exp(-off.max()), np.exp(-off.min()),
         )  # fmt: skip
     factors = np.exp(stars.exposures)

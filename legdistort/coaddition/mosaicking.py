@@ -295,7 +295,7 @@ def _settings(options, recipe, origin, correlation):
         ("RESAMPLE", str(recipe.resampling), "how they are resampled, order or kernel"),
         ("CONSERVE", options.conserve, "of stars, or of the sky"),
         ("SKYLEVEL", recipe.level if options.match_background else None, "common level of the backgrounds"),
-        ("FLXSCALE", origin, "where the flux scales come from"),
+        ("SCALEBY", origin, "where the flux scales come from"),
         ("EXTRAPOL", options.extrapolated, "pixels outside the stars used"),
         ("WEIGHTS", weights if isinstance(weights, str) else "given" if weights else "equal", "of the exposures"),
         ("NOISECOR", correlation, "noise of sums of pixels over that by UNCERT"),

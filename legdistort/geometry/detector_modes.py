@@ -78,6 +78,21 @@ def similarity_part(coefficients, shape):
     return np.eye(2, 3) + (flat @ similarity_poses(shape, n).T).reshape(*several, 2, 3)
 
 
+def pointed(static, shape):
+    """Coefficients of the same map after a similarity, as a pose has it, so that they have no part of one."""
+    degree = basis.degree_of(static.shape[1])
+    for _ in range(3):
+        back = similarity.invert(similarity_part(static, shape))
+
+        def displacement(u, v, static=static, back=back):
+            there = basis.denormalize(u, v, shape)
+            q = similarity.apply(back, there)
+            return (q - there).T + static @ basis.values(degree, *basis.normalize(q, shape))
+
+        static = basis.project(displacement, degree)
+    return static
+
+
 def similarity_poses(shape, n):
     """What the similarity part of coefficients adds to the pose that changes nothing, as a matrix (6, 2 * n_modes).
 

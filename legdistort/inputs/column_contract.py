@@ -43,6 +43,10 @@ DETECTED = {
     "crowding": (None, False),
 }
 
+#: The same of any exposure, and of positions alone.
+MEASURED = DETECTED | {"exposure": (None, False)}
+LISTED = {name: (unit, name in ("x", "y")) for name, (unit, _) in DETECTED.items()}
+
 #: Beyond these, either way, a magnitude stands for none.
 _NO_MAGNITUDE = 90
 

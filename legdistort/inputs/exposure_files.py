@@ -376,10 +376,15 @@ def file_checksums(exposures):
 
     Where base names repeat in several folders, these come before them.
     """
+    found = checksums_of_paths(exposures)
+    return dict(zip(file_names(list(found)), found.values(), strict=True))
+
+
+def checksums_of_paths(exposures):
+    """The same as ``{path: SHA-256}``."""
     files = [exposure for exposure in exposures if isinstance(exposure, ExposureFile)]
     files += [exposure.weights for exposure in files if exposure.weights is not None]
-    found = {each.path: each.checksum for each in files}
-    return dict(zip(file_names(list(found)), found.values(), strict=True))
+    return {each.path: each.checksum for each in files}
 
 
 def listed(exposures, function):

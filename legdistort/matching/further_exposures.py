@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..exceptions import AssumptionWarning, InputError, some_of, warn
+from ..exceptions import AssumptionWarning, InputError, MatchError, some_of, warn
 from ..geometry.distortion import Distortion
 from ..geometry.similarity import apply, invert, robust_similarity
 from ..inputs.repetitions import copies
@@ -125,6 +125,12 @@ def _on_its_plane(solution, seen, matches, mean):
         if len(rows):
             found[rows], located[mine] = theirs, True
         else:
+            if len(names) == 1:
+                raise MatchError(
+                    f"no star of exposure {names[0]} is one of the solution, and no other exposure is of its field: "
+                    "nothing can be learnt from it. Is it of another field, or scale? A camera alone corrects its "
+                    "positions: legdistort nights SOLUTION --out camera.asdf, then legdistort correct camera.asdf LIST"
+                )
             joins[mine] = True
             warn(
                 f"no star of exposure {some_of(names, 6)} is one of the solution: another field of its camera, or not "

@@ -10,8 +10,8 @@ from astropy.table import Table
 
 from ..cameras.camera import Camera
 from ..exceptions import AssumptionWarning, InputError, LegdistortError, some_of, warn
-from ..inputs.exposure_files import ExposureFile, file_checksums, open_exposures
-from ..inputs.exposure_names import whole_name
+from ..inputs.exposure_files import ExposureFile, checksums_of_paths, file_checksums, open_exposures
+from ..inputs.exposure_names import folder_mark, marked, whole_name
 from ..inputs.table_files import read_table, write_table
 from ..runtime import provenance
 from ..runtime.checks import options_from
@@ -88,12 +88,26 @@ class EarlierRun:
         meta = self.table.meta.get("camera")
         return None if meta is None else Camera.from_meta(meta)
 
+    def named(self, exposures):
+        """Exposures called as that run called them: of files whose names repeated, a folder stands before their names.
+
+        Parameters
+        ----------
+        exposures : list of ExposureFile
+        """
+        known = self.table.meta.get("shapes") or {}
+        return [
+            marked(each, folder_mark(each.name, each.path, known)) if isinstance(each, ExposureFile) else each
+            for each in exposures
+        ]
+
     def of(self, exposures):
         """Detections and effective PSFs of some exposures, which must be those that were measured.
 
         Parameters
         ----------
         exposures : list of ExposureFile
+            As `named` calls them.
 
         Returns
         -------
@@ -109,7 +123,8 @@ class EarlierRun:
         if without:
             raise InputError(f"{without[0]} is not in a file: nothing proves that it is what was measured; give files")
         measured = self.table.meta["inputs"]
-        for file, checksum in file_checksums(exposures).items():
+        for path, checksum in checksums_of_paths(exposures).items():
+            file = folder_mark(path.name, path, measured) + path.name
             if file not in measured:
                 raise InputError(
                     f"{file} was not measured in {self.folder}, whose frames are {some_of(list(measured), 3)}: give "
@@ -150,7 +165,7 @@ def measured_frames(tables):
     for path, table in tables.items():
         earlier = EarlierRun(path.parent, table)
         try:
-            opened = open_exposures(earlier.frames, **earlier.reading)
+            opened = earlier.named(open_exposures(earlier.frames, **earlier.reading))
             exposures += earlier.camera.of_detectors(opened) if earlier.camera else opened
             earlier.of(opened)
         except LegdistortError as error:

@@ -23,7 +23,7 @@ from ..runtime.words import UNSTATED
 from .mode_tables import mode_table
 
 if TYPE_CHECKING:
-    from astropy.table import QTable
+    from astropy.table import QTable, Table
     from numpy.typing import ArrayLike
 
     from ..inputs.exposures import Exposure
@@ -241,6 +241,26 @@ class Prior(ShownAsPrinted):
     def with_static_sigma(self, static_sigma: ArrayLike | None) -> Prior:
         """The same prior with another uncertainty `static_sigma` of its mean, in the place of a covariance too."""
         return replace(self, static_sigma=static_sigma, static_covariance=None)
+
+    @plain_numbers
+    def correct_table(self, table: Table) -> QTable:
+        """Positions in any list of its detector without the static distortion: `Camera.correct_table`, with `sigma`.
+
+        Raises
+        ------
+        InputError
+            As there; if the prior states no static distortion, or no `shape`.
+        """
+        from ..cameras.camera import Camera
+        from ..cameras.detector import Detector
+        from ..cameras.static_correction import correct_table
+
+        if not self.states_mean or self.shape is None:
+            lacks = "shape of its detector" if self.states_mean else "static distortion"
+            raise InputError(f"the prior states no {lacks}, by which positions could be corrected: give one that does")
+        name = self.source.get("name") if isinstance(self.source, dict) else self.source
+        camera = Camera(str(name or "of the prior"), {"1": Detector(self.shape, static=self)})
+        return correct_table(camera, table, None if isinstance(self.sigma, str) else self.sigma, self.table)
 
     def __repr__(self) -> str:
         if self.mean is None:

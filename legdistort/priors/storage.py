@@ -8,11 +8,14 @@ import asdf
 import numpy as np
 
 from ..cameras.camera import Camera
-from ..cameras.detector import map_alone, widths_alone
+from ..cameras.detector import map_alone, maps_of_plane, widths_alone
 from ..cameras.source import check_shape
+from ..cameras.stated_errors import FREE
 from ..exceptions import InputError, some_of
 from ..geometry import similarity
 from ..geometry.basis import check_degree
+from ..geometry.detector_modes import pointed
+from ..geometry.distortion import Distortion
 from ..results.nights import found
 from ..results.solution import Solution
 from ..runtime import provenance
@@ -128,10 +131,28 @@ def _of_detector(camera, key, kind, source):
             "legdistort prior --ext ID"
         )
     detector = camera[str(key)]
+    if camera.common_map is not None:
+        return _with_common_map(camera, str(key), kind, source)
     mean = map_alone(detector)[1]
     stated = detector.static_sigma is not None or detector.layout_sigma is not None
     widths = widths_alone(detector, mean.shape[1]) if stated else None
     return kind(mean, static_sigma=widths, shape=detector.shape, source=source | {"detector": str(key)})
+
+
+def _with_common_map(camera, key, kind, source):
+    """The same of a camera whose focal plane has a map that a reference told, which is in that of the detector."""
+    detector, n = camera[key], camera.common_map.shape[1]
+    mean = pointed(map_alone(detector, Distortion(camera.common_map, camera.field))[1], detector.shape)
+    size = mean.shape[1]
+    shared = np.zeros((2, size, 2 * n))
+    shared[:, :n] = maps_of_plane(detector, camera.field, n).reshape(2, n, -1)
+    shared = shared.reshape(2 * size, -1) * np.minimum(camera.common_sigma.ravel(), FREE)
+    covariance = np.diag(np.minimum(widths_alone(detector, size).ravel(), FREE) ** 2) + shared @ shared.T
+    source = source | {
+        "detector": key,
+        "common_map_px": float(np.sqrt(np.mean(np.sum(camera.common_map**2, axis=1)) / 4)),
+    }
+    return kind(mean, static_covariance=covariance, shape=detector.shape, source=source)
 
 
 def of_solution(solution, kind, source):

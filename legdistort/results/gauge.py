@@ -168,7 +168,7 @@ class Drift:
     def __str__(self) -> str:
         errors = self.errors()
         rate = np.sqrt(np.mean([error**2 for name, error in errors.items() if name != "parallax"])) if errors else 0.0
-        by = "the scatter of the motions of stars" if self.held else "the smallest dynamic part"
+        by = "the scatter of the motions of stars, and that of exposures" if self.held else "the smallest dynamic part"
         words = (
             f"Motions. Maps that change with time as motions of all stars would are in the null space too: "
             f"{self.n_constraints} modes, fixed by {by}. Absolute error of a motion {rate:.2g} px/yr rms over the "

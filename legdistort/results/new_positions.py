@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from astropy import units as u
+from scipy.spatial import cKDTree
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry import basis, similarity
@@ -23,6 +24,8 @@ from ..inputs import column_contract
 from .errors import absolute_errors, common_maps
 from .motions import fitted
 
+#: Positions that agree to this [pix] are one, as tables with rounded numbers have it; exposures are this far apart.
+_SAME, _APART = 1e-3, 1e6
 #: Positions that a warning names.
 _MOST_NAMED = 3
 
@@ -314,6 +317,8 @@ def correct_table(solution, table, epoch=None):
         off[rows] = _is_off(view, table[rows])
     _warn_of_extrapolation(table, np.flatnonzero(off))
     out = table.copy()
+    if "star" not in out.colnames:
+        out["star"] = _stars_of(solution, table, pixels)
     out["x"], out["y"] = xy.T * u.pix
     out["x_err_abs"], out["y_err_abs"] = np.sqrt(np.einsum("nkk->kn", absolute)) * u.pix
     column_contract.set_covariance(out, relative)
@@ -324,16 +329,46 @@ def correct_table(solution, table, epoch=None):
     return column_contract.describe_stars(out)
 
 
+def _stars_of(solution, table, pixels):
+    """Star of the solution that has the same position of the same exposure, (n,); -1, or an empty text, for none."""
+    known, names = solution.residuals, np.array(solution.names)
+
+    def points(exposures, xy):  # exposures are far apart in one more dimension
+        order = np.argsort(names)
+        number = order[np.searchsorted(names[order], np.asarray(exposures).astype(str))]
+        return np.column_stack([number * _APART, xy])
+
+    seen = points(known["exposure"], np.column_stack([known[name].to_value(u.pix) for name in "xy"]))
+    distance, row = cKDTree(seen).query(points(table["exposure"], pixels), distance_upper_bound=_SAME)
+    star, found = np.asarray(known["star"]), np.isfinite(distance)
+    out = np.full(len(found), "" if star.dtype.kind == "U" else -1, dtype=star.dtype)
+    out[found] = star[row[found]]
+    return out
+
+
 def _parts(solution, table):
     """Views and the rows of a table that are of them."""
     exposures = np.asarray(table["exposure"]).astype(str)
     for name in dict.fromkeys(exposures.tolist()):
         rows = np.flatnonzero(exposures == name)
+        view = _of_exposure(solution, name)
         if not solution.camera.has_focal_plane:
-            yield solution[name], rows
+            yield view, rows
             continue
         detector = solution.camera.ids(table[rows])
         yield from ((solution[name, key], rows[detector == key]) for key in dict.fromkeys(detector.tolist()))
+
+
+def _of_exposure(solution, name):
+    """The view of an exposure; of another one the message says what corrects its positions."""
+    try:
+        return solution[name]
+    except InputError as error:
+        by = "its file by legdistort nights SOLUTION --out camera.asdf, then legdistort correct camera.asdf LIST"
+        by = "solution.camera.correct_table(list)" if solution.camera.has_focal_plane else by
+        raise InputError(
+            f"{error}; positions of other exposures are corrected for the static distortion alone, by a camera: {by}"
+        ) from None
 
 
 def _is_off(view, rows):

@@ -128,7 +128,7 @@ def table(solution):
                 "exposures": ", ".join(np.array(solution.names)[own]),
             }
         )
-    out = QTable(rows=sorted(rows, key=lambda row: (not row["odd"], row["p"], -row["ratio"])))
+    out = NightsTable(rows=sorted(rows, key=lambda row: (not row["odd"], row["p"], -row["ratio"])))
     for name, unit in {"epoch": u.yr, "rms": u.pix, "departure": u.pix}.items():
         out[name] = out[name] * unit
     for name, shown in _FORMATS.items():
@@ -140,14 +140,29 @@ _FORMATS = {"epoch": ".4f", "rms": ".4f", "rms_ratio": ".3f", "departure": ".4f"
 _FORMATS |= {"dof": ".0f", "p": ".2g"}
 
 
+class NightsTable(QTable):
+    """Nights, printed with what counts in the width of a terminal: lists of exposures are as long as nights are."""
+
+    def __str__(self) -> str:
+        return "\n".join(_lines(self)) if {"name", *_SHOWN, "odd"} <= set(self.colnames) else super().__str__()
+
+
+_SHOWN = "n_exposures", "n_stars", "rms", "rms_ratio", "departure", "ratio", "dof", "p"
+
+
 def lines(solution):
-    """What `print` shows of them; nothing of a single one."""
+    """What `print` of a solution shows of them; nothing of a single one."""
     nights = solution.nights
-    if len(nights) < 2:
-        return []
-    width = max(10, *map(len, nights["name"]))
-    out = ["", f"{'night':{width}s} {'exposures':>9s} {'stars':>5s} {'rms':>7s} {'rms/error':>9s} {'departure':>9s} "
-               f"{'ratio':>6s} {'p':>8s}"]  # fmt: skip
+    return ["", *_lines(nights)] if len(nights) > 1 else []
+
+
+def _lines(nights):
+    width = max([10, *map(len, nights["name"])])
+    out = [
+        f"{'night':{width}s} {'exposures':>9s} {'stars':>5s} {'rms':>7s} {'rms/error':>9s} {'departure':>9s} "
+        f"{'ratio':>6s} {'p':>8s}",
+        f"{'px':>{width + 24}s} {'px':>19s}",
+    ]
     for row in nights:
         departure = f"{row['departure'].value:9.4f} {row['ratio']:6.2f} {row['p']:8.2g}" if row["dof"] else f"{'-':>9s}"
         out.append(

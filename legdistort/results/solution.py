@@ -182,6 +182,7 @@ class Solution(ShownAsPrinted):
         (p < 0.001 over the number of nights, and three times as far), and the rest is compared without it; none is
         where there are no two others. Of two nights p is that of no departure at all. Without others, and where
         exposures have no distortion of their own, there is no departure (NaN, ``dof`` 0). ``exposures``: their names.
+        `print` shows the columns that tell how a night differs; ``pprint_all()`` shows all.
         """
         return nights.table(self)
 
@@ -289,7 +290,9 @@ class Solution(ShownAsPrinted):
         `~astropy.table.QTable`
             Row by row, with columns that are named as in `stars`: ``x``, ``y``, their errors relative and absolute, and
             if the sky is known ``ra``, ``dec``, ``ra_error``, ``dec_error`` [mas], ``ra_dec_corr``, ``ra_error_abs``,
-            ``dec_error_abs``; and the other columns of the table.
+            ``dec_error_abs``; and the other columns of the table. Without a column ``star`` it gets one, with the star
+            of `stars` whose observation a row is: of the same exposure at the same place, to 0.001 px; -1 or an empty
+            text for none.
 
         Raises
         ------

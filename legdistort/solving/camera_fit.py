@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..cameras.detector import affine_of
+from ..cameras.detector import affine_of, moved_by
 from ..cameras.stated_errors import resized
 from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, LegdistortError, SolveError, warn
 from ..geometry import basis, similarity
 from ..priors.prior import Prior
-from ..results.errors.camera_errors import CameraErrors, Departure, moved_by, unit_errors
+from ..results.errors.camera_errors import CameraErrors, Departure, unit_errors
 from ..results.new_positions import widened_all
 from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA
@@ -396,12 +396,13 @@ def _tell_unknown(matches, step, unknown):
     named = keys[np.argsort(-energy.sum(axis=(1, 2)), kind="stable")][:4]
     groups = camera.groups(matches.table)
     apart = f" (no star in common: {' | '.join(', '.join(group) for group in groups)})" if len(groups) > 1 else ""
+    lie = step.free[:, :, :3].any()
+    known = "how well the layout is known (layout_sigma)" if lie else "what is known of them (camera=, --camera)"
     warn(
         f"{len(unknown)} unknowns of camera {camera.name} are not determined by these exposures and stay where they "
         f"were, above all of detector {', '.join(named)}{apart}: stars that one detector sees in one exposure and "
-        "another in the next determine how these lie; dither over the gaps, or say how well the layout is known "
-        "(layout_sigma); if these dithers are larger than the gaps, the layout is too far off to find such stars "
-        "(camera=, --camera)",
+        f"another in the next determine how these {'lie' if lie else 'distort'}; dither over the gaps, or say {known}; "
+        "if these dithers are larger than the gaps, the layout is too far off to find such stars (camera=, --camera)",
         AssumptionWarning,
     )
 

@@ -275,7 +275,7 @@ def solve(
     with single_fit.threads(given), minimisers.iterations_shown(progress):
         join, tie = reference_tie.ties_to(catalogue, epoch=epoch, pixel_scale=pixel_scale)
         fit, found, (options, chosen) = fit_with(asked.terms, tie, _fitted, given, options, sought, join)
-        _tell(fit, given)
+        _tell(fit, given, tied=tie is not None)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
         diagnostics = _diagnostics(given, fit, prior, scale, pointing=given.pointing, terms=found(scale), **chosen)
         fit = _placed(fit, sought, given, whole) if tie is None else tie(fit, scale=scale)
@@ -538,9 +538,12 @@ def _choose_degree(matches, options):
     return chosen
 
 
-def _tell(fit, matches):
-    """Log how the fit ended and what it left out, and warn of what these exposures cannot determine."""
-    log.info("%s; %s", fit.result.status, goodness(fit))
+def _tell(fit, matches, *, tied):
+    """Log how the fit ended and what it left out, and warn of what these exposures cannot determine.
+
+    A reference to which it will be `tied` adds to the data.
+    """
+    log.info("%s; %s%s", fit.result.status, "without the reference " * (tied and fit.dof < 1), goodness(fit))
     _tell_lost_exposures(fit, matches)
     _tell_lost_stars(fit)
     fields = None if fit.tabled is None else fit.tabled.errors

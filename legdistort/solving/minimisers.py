@@ -155,10 +155,10 @@ def solve_joint(
         if not (freer.converged and is_explained(freer.blocks.chi2, run.system)):
             break
         run = freer
-    declared = run.rules.hold or (run.released is None and not problem.terms.is_held)
+    declared = run.rules.hold or run.released is None
     convention = run.convention if declared else run.declared()
-    if run.finds_plane:
-        convention = known_poses.determined(run.system, convention, run.violation)
+    if run.finds_plane or (run.finds_drift and declared):
+        convention = known_poses.determined(run.system, convention, run.violation, plane=run.finds_plane)
     status = f"converged after {len(run.steps)} iterations"
     if not run.converged:
         status = (
@@ -237,7 +237,8 @@ class _Descent:
         near = step < _NEAR and step < _MUCH_SMALLER * last < np.inf and self.convention.static == "exact"
         self.on_trial = not near and step < _SMALLER * last and self.rules.loss == "linear"
         if self.n_made < _MADE and step > _STEADY * self.rules.tolerance and not near:
-            how = {"released": self.released, "common": self.rules.common, "all_drifts": self.rules.hold}
+            drifts = self.rules.hold or self.problem.terms.is_held
+            how = {"released": self.released, "common": self.rules.common, "all_drifts": drifts}
             how |= {"settled": self.rules.settled}
             self.convention = constraints.make(self.rules.gauge, self.weighted, self.state, self.blocks, **how)
             self.n_made += 1
@@ -269,16 +270,21 @@ class _Descent:
         return stars or self.problem.pose_width is not None
 
     @property
+    def finds_drift(self):
+        """Whether J has something that determines maps which change with time, unless these are held in theirs."""
+        return self.problem.terms.is_held and not self.rules.hold
+
+    @property
     def violation(self):
         """How far the state is from the values of the constraints."""
         return self.convention.violation(_departure(self.problem, self.state))
 
     def _target(self):
         """What is lacking to the values of the constraints, or to those that J and these determine together."""
-        if not self.finds_plane:
+        if not (self.finds_plane or self.finds_drift):
             return -self.violation
         self.stepping = self.stepping or self.system
-        return known_poses.balanced(self.stepping, self.convention, self.violation)
+        return known_poses.balanced(self.stepping, self.convention, self.violation, plane=self.finds_plane)
 
     def descend(self, max_iterations):
         """Iterate until the next step would be below the tolerance."""

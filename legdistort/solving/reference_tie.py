@@ -48,8 +48,6 @@ _MAP_ROUNDS = 2
 #: Stars of a reference off by so many times the median of those on the same detectors join nothing: of Rayleigh's
 #: distribution that is chance below 1e-19, and maps that the exposures leave open make the median larger.
 _MISMATCH = 8.0
-#: Factor on errors that are to be found.
-_TINY = 1e-6
 #: Modes of maps from which stars are held: of fewer, shear is one that exposures determine by themselves.
 FEWEST_MODES = 3
 
@@ -249,9 +247,7 @@ class ReferenceTie:
 
     def _estimate(self, equations, near):
         """Equations with errors of the reference as they turn out, the map that these give, and the `Tie`."""
-        # errors that are to be found let no mismatch pass
-        offered = equations.times(_TINY) if self.finds_errors else equations
-        used = catalogue_map.accepted(offered, self.label, near)
+        used = catalogue_map.accepted(equations, self.label, near, found=self.finds_errors)
         step, made, dof = catalogue_map.estimate(equations, used, self.names)
         factor = catalogue_map.error_factor(equations, used, made.ratio, dof, found=self.finds_errors)
         if factor != 1:

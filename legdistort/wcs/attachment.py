@@ -500,7 +500,7 @@ def _nothing(known, path, name):
     if name not in known.left_out:
         raise InputError(
             f"{path}: no exposure {name!r} in the solution; it has {some_of(list(known.views), _MOST_NAMED)}; frames "
-            "are identified by their names"
+            "are identified by their names; leave it off the list, or bring it into the solution (solve --base)"
         )
     log.warning("%s: skipped, it was left out of the solution (%s)", path, known.left_out[name])
     return {}

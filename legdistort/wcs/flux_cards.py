@@ -31,7 +31,12 @@ class FluxCards:
 
     def tell(self, views):
         """Say which factors the texts of some images have, or that they have none."""
-        if len(self.solution) < 2:
+        n_all = len(self.solution)
+        if n_all < 2:
+            log.warning(
+                "no FLXSCALE in the text: nothing tells the depth of one exposure alone; with others, solve --base "
+                "RESULTS brings it into their solution, and attach --head writes the texts of all of them"
+            )
             return
         if self.factors is None:
             log.warning(
@@ -44,3 +49,8 @@ class FluxCards:
             "FLXSCALE %.3g to %.3g by the fluxes of %d stars brings values to an exposure of mean depth; "
             "SWarp leaves it out with -FSCALE_KEYWORD NONE", min(scales), max(scales), self.factors.n_stars,
         )  # fmt: skip
+        if (n := len({view.name for view in views})) < n_all:
+            log.warning(
+                "texts of %d of the %d exposures of the solution: their mean depth is that of all %d, and not that of "
+                "texts which another solution wrote; a stack takes all its texts from one", n, n_all, n_all,
+            )  # fmt: skip

@@ -74,6 +74,19 @@ def test_bright_stars_that_were_cut_are_missed():
     assert "bright peaks of the stack have no star in the solution" in check.sentence
 
 
+def test_cosmic_rays_where_two_exposures_meet_are_no_stars_that_were_lost():
+    """Nothing tells them from stars there, and half of the stars lie there."""
+    xy, flux, image = field(3)
+    rng, footprint = np.random.default_rng(8), np.full(image.shape, 5, dtype=np.uint8)
+    footprint[:, : SIZE // 2] = 2
+    y, x = rng.integers(20, SIZE - 20, 80), rng.integers(20, SIZE // 2 - 20, 80)
+    image[y, x] += 5000.0
+    light = looked_at(image, xy, flux, footprint=footprint)
+    assert light.share_without < 0.1
+    assert state(light).state == "pass"
+    assert looked_at(image, xy, flux).share_without > 0.3
+
+
 def test_saturated_stars_and_single_frames_are_not_missed():
     xy, flux, image = field(1)
     cut = np.argsort(-flux)[:26]

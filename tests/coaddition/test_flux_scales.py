@@ -159,7 +159,7 @@ class TestFluxScale:
         ]
         cloudy = measured(solution, observed(depth, noise=0.002, outliers=0.05))
         mosaic = coadd(dimmed, cloudy, method="clipped")
-        assert mosaic.header["FLXSCALE"] == "stars"
+        assert mosaic.header["SCALEBY"] == "stars"
         assert mosaic.header["EXPTIME"] == 30
         bright = flux > 2e4
         xy = (stars - mosaic.offset)[bright]
@@ -391,7 +391,7 @@ def test_header_says_how(tmp_path):
     solution, *_, exposures, _ = plain()
     mosaic = coadd(exposures, solution, weights=None, order=1)
     header = mosaic.to_hdulist()[0].header
-    assert (header["WEIGHTS"], header["FLXSCALE"], header["EXTRAPOL"]) == ("equal", "exptime", "flag")
+    assert (header["WEIGHTS"], header["SCALEBY"], header["EXTRAPOL"]) == ("equal", "exptime", "flag")
     assert header["NOISECOR"] == pytest.approx(1.5, rel=0.02)  # pixels are not of one size
     mosaic.write(tmp_path / "m.fits")
     np.testing.assert_array_equal(fits.getdata(tmp_path / "m.fits", "FLAGS"), mosaic.flags)

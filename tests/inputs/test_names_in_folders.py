@@ -4,12 +4,15 @@ import shutil
 
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.io import fits
-from astropy.table import Table
+from astropy.table import QTable, Table, vstack
 
 from legdistort.cli.parser import main
 from legdistort.exceptions import InputError
 from legdistort.inputs.exposure_files import file_checksums, open_exposures, read_exposures
+from legdistort.measurement.earlier import EarlierRun, measured_frames, write_detections
+from legdistort.measurement.options import MeasureOptions
 from legdistort.results.solution import Solution
 from legdistort.results.view import image_view
 from legdistort.wcs.attachment import attach
@@ -79,6 +82,30 @@ def test_a_solution_goes_into_its_frames(frames, geometry, tmp_path):
     assert [image_view(solution, each).name for each in open_exposures(frames[2:])] == list(NAMES[2:])
     with pytest.raises(InputError, match="no exposure 'c0010' in the solution"):
         attach(geometry(2, 1.0, shape=SHAPE, names=("20220424_c00101", "x")), frames[0], in_place=True)
+
+
+def test_an_earlier_run_knows_its_frames(frames, tmp_path, monkeypatch):
+    """One night of it alone, and what comes from that; another frame of the same number is none of them."""
+    one = np.ones(1) * u.pix
+    table = vstack([QTable({"exposure": [name], "x": one, "y": one, "x_err": one, "y_err": one}) for name in NAMES])
+    opened, results = open_exposures(frames), [tmp_path / "first", tmp_path / "second"]
+    for folder in results:
+        folder.mkdir()
+    write_detections(results[0] / "detections.ecsv", table, opened, results[0], measuring=MeasureOptions())
+    monkeypatch.chdir(frames[2].parent)
+    earlier = EarlierRun.read(results[0])
+    night = earlier.named(open_exposures(["c0010.fits", "c0011.fits"]))
+    assert [each.name for each in night] == list(NAMES[2:])
+    detections, _ = earlier.of(night)
+    assert detections["exposure"].tolist() == list(NAMES[2:])
+    assert [each.name for each in earlier.named(opened)] == list(NAMES)
+    assert len(earlier.of(earlier.named(opened))[0]) == 4
+    write_detections(results[1] / "detections.ecsv", detections, night, results[1], measuring=MeasureOptions())
+    later = EarlierRun.read(results[1])
+    again = measured_frames({results[1] / "detections.ecsv": later.table})
+    assert [each.name for each in again] == list(NAMES[2:])
+    with pytest.raises(InputError, match=r"c0010\.fits is not as it was measured"):
+        later.of(later.named(open_exposures(frames[:1])))
 
 
 def test_lists_of_nights(tmp_path, capsys):

@@ -46,6 +46,30 @@ def free(sim):
     return ld.solve(plain.matches)
 
 
+# -- which star it is
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_rows_that_are_observations_have_their_star(solution, named):
+    if named:
+        names = {k: f"s{k}" for k in solution.estimate.star_names.tolist()}
+        residuals = solution.residuals.copy()
+        residuals.replace_column("star", [names[k] for k in residuals["star"].tolist()])
+        solution = replace(solution, residuals=residuals)
+    seen = solution.residuals[np.random.default_rng(2).permutation(len(solution.residuals))[:50]]
+    table = seen["exposure", "x", "y", "x_err", "y_err"]
+    for name in "xy":
+        table[name] = np.round(table[name], 4)
+    table["x"][7] += 0.01 * u.pix
+    swapped = "exp00" if table["exposure"][9] != "exp00" else "exp01"
+    table["exposure"][9] = swapped
+    expected = np.asarray(seen["star"]).copy()
+    expected[[7, 9]] = "" if named else -1
+    assert_array_equal(solution.correct_table(table)["star"], expected)
+    table["star"] = "own"
+    assert set(solution.correct_table(table)["star"]) == {"own"}
+
+
 # -- what moves a corrected position
 
 

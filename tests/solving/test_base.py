@@ -118,6 +118,16 @@ def test_options_of_the_base_give_way():
     assert (found.settings.degree, found.settings.clip) == (3, 4.0)
 
 
+def test_a_size_of_the_static_distortion_stays():
+    """A number is all that there is to keep of it."""
+    old, new = parts(simulated().matches.table, ["exp07"])
+    known = ld.Prior(None, static_sigma=5.0)
+    base = ld.solve(old, prior=known)
+    found, given = ld.solve(new, base=base), ld.solve(new, base=base, prior=known)
+    assert found.settings.prior == base.settings.prior
+    assert found.chi2 == given.chi2
+
+
 def test_new_stars_join_if_two_exposures_see_them():
     table = simulated().matches.table
     late, seen = ["exp06", "exp07"], np.unique(table["star"])
@@ -221,6 +231,12 @@ def test_refused(tmp_path):
     with_prior = ld.solve(old, prior=EVIDENCE)
     refused(re.escape("solved with a prior, of which it keeps a description alone: give it again (prior=, --prior)"),
             base=with_prior)  # fmt: skip
+    elsewhere = new.table.copy()
+    for seed, axis in enumerate("xy"):
+        elsewhere[axis] = np.random.default_rng(seed).uniform(0, 2000, len(elsewhere)) * elsewhere[axis].unit
+    elsewhere["star"] += 1000
+    with pytest.raises(MatchError, match="no star of exposure exp07 is one of the solution, and no other exposure is"):
+        ld.solve(ld.Matches.from_table(elsewhere, shape=SHAPE), base=base)
     tied = ld.solve(old, reference=base)
     refused("solved with a reference, of which", base=tied)
     assert len(ld.solve(new, base=tied, reference=base).names) == 8

@@ -1,6 +1,7 @@
 """The model of a common map: what counts as known, and how far single exposures scatter."""
 
 import contextlib
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +17,7 @@ from legdistort.results.gauge import UnknownMap
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving.estimation import solve
 from legdistort.solving.gauge import catalogue_map, constraints, dynamic_scatter, hierarchy
+from legdistort.solving.gauge.catalogue_agreement import agreement
 
 
 @pytest.fixture(scope="module")
@@ -256,6 +258,17 @@ def offsets(pulls):
     made = catalogue_map.Offsets(np.arange(n), np.column_stack([pulls, np.zeros(n)]), np.stack([np.eye(2)] * n))
     prior = catalogue_map.MapPrior(np.zeros((6, 6)), np.zeros(6), PlaneModes(np.array([[[0.0, 0], [1, 1]]]), 3))
     return catalogue_map.MapEquations(made, directions, 1e-6 * np.eye(2 * n), prior)
+
+
+def test_a_bend_that_nothing_tests_has_no_size():
+    """Of two shears one is known to 0.01 px, the other not at all: what is left of its information is rounding."""
+    for better in range(1, 40):
+        equations = offsets(np.random.default_rng(0).normal(size=30)).times(1 / better)
+        shear = equations.prior.modes.others[0]
+        equations.prior = replace(equations.prior, information=1e4 * np.outer(shear, shear))
+        made = agreement(equations, equations, np.ones(30, dtype=bool))
+        assert made.bend_dof == 1
+        assert made.unseen == np.inf
 
 
 def test_mismatches_are_judged_by_the_scatter_that_is_seen():

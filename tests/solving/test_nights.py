@@ -42,6 +42,22 @@ def squares(sets, **options):
     return np.array(sums)
 
 
+# --- how they are printed ----------------------------------------------------------------------------------------
+
+
+def test_a_printed_table_of_nights_fits_into_a_terminal():
+    """With more exposures than a line can name; rows and parts of it are printed, too."""
+    nights = ld.solve(matches(Nights(0, nights=8, per=2, n_stars=60).table), degree=2).nights
+    printed = str(nights).splitlines()
+    assert len(printed) == 10
+    assert max(map(len, printed)) <= 79
+    assert printed[0].split() == ["night", "exposures", "stars", "rms", "rms/error", "departure", "ratio", "p"]
+    assert printed[1].split() == ["px", "px"]
+    assert [line.split()[0] for line in printed[2:]] == nights["name"].tolist()
+    assert str(nights[:0]).splitlines() == printed[:2]
+    assert str(nights["name", "chi2"]).split()[:2] == ["name", "chi2"]
+
+
 # --- which exposures are of one night ----------------------------------------------------------------------------
 
 

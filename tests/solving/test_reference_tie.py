@@ -6,6 +6,8 @@ import re
 import warnings
 from dataclasses import replace
 
+import dense_model
+import drawn_sets
 import numpy as np
 import pytest
 from astropy import units as u
@@ -254,6 +256,63 @@ def test_errors_that_a_catalogue_does_not_state(sim, stated, asked):
     assert ("its errors were found: 0.0" in str(solution.gauge)) == (asked == "found")
     assert sorted(tie.stars[~tie.used]) == sorted(reference["star"][:3])
     assert np.mean(pulls(sim, solution) ** 2) == pytest.approx(1, abs=0.4)
+
+
+#: Nine exposures that no prior knows, three of them turned: each with a distortion of its own, or all with one.
+OPEN = {"each": ({"dynamic": 0.025}, {}), "one for all": ({"dynamic": 0.0}, {"static": "fit"})}
+
+
+def open_night(seed, kind, *, error=0.2, stated=None, outliers=0.05, asked=None):
+    """Solved with a catalogue whose errors are much larger than those of stars, some of it 3 px off; and the truth.
+
+    The solution, positions of the catalogue's plane (n_stars, 2) of its stars, and the names of the outliers. Stars are
+    known to 0.003 to 0.08 px.
+    """
+    drawn, how = OPEN[kind]
+    data, true = dense_model.drawn_set(
+        seed, n_stars=160, n=9, size=1024, dither=60.0, angles=np.repeat([0.0, 20.0], [6, 3]), static=0.3,
+        errors=(0.008, 0.08), **drawn,
+    )  # fmt: skip
+    rng = RNG([seed, 9])
+    rows = rng.permutation(len(true["stars"]))[:100]
+    xy, angle = true["stars"][rows] + error * rng.normal(size=(100, 2)), rng.uniform(0, 2 * np.pi, 100)
+    wrong = np.arange(100) < 100 * outliers
+    xy[wrong] += 3 * np.column_stack([np.cos(angle), np.sin(angle)])[wrong]
+    table = Table({"star": rows, "x": xy[:, 0], "y": xy[:, 1]})
+    if stated is not None:
+        table["x_err"] = table["y_err"] = stated
+    with warnings.catch_warnings(action="ignore", category=AssumptionWarning):
+        solution = solve(drawn_sets.as_matches(data), **how, reference=table, reference_error=asked)
+    return solution, true["stars"][solution.estimate.star_names], set(rows[wrong])
+
+
+@pytest.mark.parametrize("kind", OPEN)
+@pytest.mark.parametrize(("stated", "asked"), [(0.05, "found"), (None, "found"), (0.05, None), (0.0002, None)])
+def test_errors_are_found_from_good_stars_alone_and_from_all_of_them(kind, stated, asked):
+    """A factor on the errors of both would reject bright stars, whose own are small, and keep faint ones as far off."""
+    solution, _, wrong = open_night(1, kind, stated=stated, asked=asked)
+    tie = solution.gauge.tie
+    assert set(tie.stars[~tie.used]) == wrong & set(tie.stars)
+    n = np.count_nonzero(tie.used)
+    assert np.sqrt(np.mean(tie.known[:, 0, 0])) == pytest.approx(0.2, rel=3 / np.sqrt(4 * n))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", OPEN)
+@pytest.mark.parametrize(("stated", "outliers"), [(0.05, 0.0), (None, 0.05)])
+def test_absolute_errors_are_calibrated_where_those_of_the_catalogue_are_found(kind, stated, outliers):
+    """Over 12 sets, with at most one good star of a set left out, and no wrong one used."""
+    squares, sizes = [], []
+    for seed in range(12):
+        solution, true, wrong = open_night(seed, kind, stated=stated, outliers=outliers, asked="found")
+        tie, errors = solution.gauge.tie, [solution.stars[f"{axis}_err_abs"].value for axis in "xy"]
+        out = set(tie.stars[~tie.used])
+        assert wrong & set(tie.stars) <= out
+        assert len(out - wrong) <= 1
+        squares.append(np.nanmean(((solution.estimate.positions - true) / np.column_stack(errors)) ** 2))
+        sizes.append(np.mean(tie.known[:, 0, 0]))
+    assert np.mean(squares) == pytest.approx(1, abs=0.3)
+    assert np.sqrt(np.mean(sizes)) == pytest.approx(0.2, rel=0.06)
 
 
 def test_an_exact_catalogue_is_found_to_be_better_than_the_exposures(sim):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+import legdistort as ld
 from legdistort.cameras.star_scales import star_scales
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving.estimation import solve
@@ -59,8 +60,18 @@ def test_texts_bring_counts_to_one_scale(one, tmp_path, caplog):
     assert f"FLXSCALE {scales.min():.3g} to {scales.max():.3g} by the fluxes of {N_STARS} stars" in caplog.text
     attach(solution, paths[2], kind="head", out=tmp_path / "alone")  # not relative to those that are attached
     assert cards(tmp_path / "alone" / "exp02.head")["FLXSCALE"] == scales[2]
+    assert f"texts of 1 of the {len(paths)} exposures of the solution" in caplog.records[-1].message
     attach(solution, paths[:1], kind="tpv", out=tmp_path / "copies")
     assert fits.getheader(tmp_path / "copies" / "exp00.fits")["FLXSCALE"] == 7.0
+
+
+def test_one_exposure_alone_says_what_brings_it_to_the_scale_of_others(one, tmp_path, caplog):
+    reference, _ = solved(one)
+    table = reference.residuals[np.asarray(reference.residuals["exposure"]) == reference.names[0]]
+    alone = ld.solve(ld.Matches.from_table(table, shape=SHAPE), reference=reference)
+    attach(alone, frames(tmp_path, alone.names), kind="head", out=tmp_path / "heads")
+    assert "FLXSCALE" not in cards(tmp_path / "heads" / f"{alone.names[0]}.head")
+    assert "solve --base RESULTS brings it into their solution" in caplog.text
 
 
 @pytest.mark.parametrize("known", [{"flux": False}, FEW])

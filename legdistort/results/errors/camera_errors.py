@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...cameras.detector import moved_by
 from ...geometry import basis, similarity
 from ...runtime.trees.facts import array, number
 
@@ -163,13 +164,3 @@ def unit_errors(covariance):
     sizes, vectors = np.linalg.eigh(covariance)
     kept = sizes > _ROUNDING * sizes.max(initial=0)
     return vectors[:, kept] * np.sqrt(sizes[kept])
-
-
-def moved_by(detector, q, changes):
-    """How changes (2, n_modes, k) of the modes of a detector move what it measured, in the focal plane, (n, 2, k).
-
-    Modes of orders 0 and 1 are its layout, which moves the static distortion along. `q` (n, 2) are undistorted pixels.
-    """
-    values = basis.values(basis.degree_of(changes.shape[1]), *basis.normalize(q, detector.shape))
-    low, high = (np.einsum("amk,mn->nak", changes[:, part], values[part]) for part in (slice(0, 3), slice(3, None)))
-    return -np.linalg.inv(detector.layout[:, :2]) @ (low + np.linalg.inv(detector.distortion.jacobian(q)) @ high)

@@ -29,7 +29,8 @@ class Agreement:
     bend : float
         By how much it departs from that, pixels, rms over the stars and axes; NaN where it was not determined.
     unseen : float
-        Rms [px] up to which a bend of the reference would not be found, 19 times of 20; infinite if nothing tests it.
+        Rms [px] up to which a bend of the reference would not be found, 19 times of 20; infinite if nothing tests it,
+        that is, if the exposures and the prior leave a bend open by a pixel.
     cure : int
         Lowest degree of a map of its own with which it would agree, where it is bent; 0 for none.
     years : float

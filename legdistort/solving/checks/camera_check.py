@@ -225,7 +225,11 @@ def undetermined(solution):
     if errors is None or not errors.unknown.shape[2]:
         return None
     apart = ties.apart(solution.camera, solution.residuals)
-    words = f"these exposures do not determine how the detectors lie to each other{f' ({apart})' * bool(apart)}"
+    apart = f" ({apart})" * bool(apart)
+    if not errors.free[:, :, :3].any():  # the layout is held
+        words = f"these exposures do not determine the static distortions of the detectors beside each other{apart}"
+        return words, f"{_TIE}, or what is known of them (a camera file, --camera), or leave --static fit out"
+    words = f"these exposures do not determine how the detectors lie to each other{apart}"
     return words, f"{_tying(solution, _headers_by_group(solution) is not None)}; {_NEARER}"
 
 
@@ -268,8 +272,10 @@ def _held(effects, name, residuals, observed, error, judged):
         found = f"exposures do not agree with {given}, by {rms:.2g} px rms: {cause.found}"
         return Check("camera", state, rms, error, found, cause.cure, factors)
     if not all(shown * (SEEN * error) ** 2 >= addition_that_shows(score.nu) for score, shown in tests.values()):
-        return Check("camera", "unknown", None, None, f"{given} are believed, not tested", _TELL, factors)
-    return Check("camera", "pass", None, None, f"exposures agree with {given}{little}", tests=factors)
+        are = "is" if were == "was" else "are"
+        return Check("camera", "unknown", None, None, f"{given} {are} believed, not tested", _TELL, factors)
+    bent = "" if STATICS in effects else "; static distortions that are fitted hide a wrong one where they bend for it"
+    return Check("camera", "pass", None, None, f"exposures agree with {given}{little}{bent}", tests=factors)
 
 
 def _stated(solution, departure):

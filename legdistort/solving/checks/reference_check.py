@@ -13,6 +13,11 @@ from .limits import GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, as_one, of_chi2
 _FEWEST = 10
 #: Part of what is uncertain of a map that a reference must take away to tie it.
 _TIED = 0.1
+#: What to do about offsets that are larger than expected.
+_OFFSETS = (
+    "if it is of another year and without proper motions, --reference-error found, or errors that contain the years "
+    "times a usual motion; else look at its errors and their unit, and its epoch (ref_epoch)"
+)
 _TESTED = "more of its stars, dithers by a good part of the field, a turned camera, or a prior test it"
 
 
@@ -81,9 +86,8 @@ def _scatter(name, tie, ratio, solution):
         return Check("reference", state, ratio, np.sqrt(high),
                      f"{found}; they agree with epochs that are {abs(made.years):.2g} years {when}",
                      "look at its epoch (ref_epoch) and that of the exposures (--epoch)")  # fmt: skip
-    return Check("reference", state, ratio, np.sqrt(high), found,
-                 "look at its errors and their unit, its epoch (ref_epoch), its proper motions; "
-                 "--reference-error found takes its errors from this")  # fmt: skip
+    counted = "" if tie.factor == 1 else "absolute errors contain this factor; "
+    return Check("reference", state, ratio, np.sqrt(high), found, counted + _OFFSETS)
 
 
 def _mismatches(name, tie, ratio, solution):

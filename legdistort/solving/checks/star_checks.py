@@ -15,6 +15,8 @@ _WORSE = 5.0
 _FEWEST, _LEFT_OUT = 4, 2
 #: Cuts between two groups of observations that are tried at most.
 _CUTS = 64
+#: Motions that observations check, from which others may be said to be unlike them; a scatter by medians (normal).
+_CHECKED, _MAD = 10, 1.4826
 
 
 def overlaps_check(solution, residuals):
@@ -36,7 +38,43 @@ def overlaps_check(solution, residuals):
 
 
 def stars_check(solution, observed):
-    """Are there stars whose observations contradict each other?"""
+    """Are there stars whose observations contradict each other, or that move unlike all others for two epochs alone?"""
+    check, found = _contradictions(solution, observed), _unlike(solution)
+    if not found:
+        return check
+    named = ", ".join(found[:MOST_NAMED]) + f" and {len(found) - MOST_NAMED} more" * (len(found) > MOST_NAMED)
+    move, seen = ("moves", "it was seen") if len(found) == 1 else ("move", "they were seen")
+    said = (
+        f"{_counted(len(found))} {move} unlike all others, and nothing checks that, {seen} at two epochs only: {named}"
+    )
+    if check.state == "pass":
+        return Check("stars", "warn", len(found), 0, said,
+                     "mismatched, or fast: look at these; take the rows of what is no single star out of matched.ecsv"
+                     )  # fmt: skip
+    return Check("stars", "warn", check.value + len(found), 0, f"{check.sentence}; {said}", check.cure)
+
+
+def _unlike(solution):
+    """Stars seen at two epochs that move farther from the others than any does that observations check, in words."""
+    motions = solution.estimate.motions
+    if motions is None:
+        return []
+    v, stars = motions.values[:, :2], solution.stars
+    error = np.sqrt((stars["vx_err"].value ** 2 + stars["vy_err"].value ** 2) / 2)
+    known = np.isfinite(v).all(axis=1) & np.isfinite(error)
+    checked, others = known & (motions.n_epochs > 2), known & (motions.n_epochs == 2)
+    if np.count_nonzero(checked) < _CHECKED:
+        return []
+    away = v - np.median(v[checked], axis=0)
+    scatter = _MAD * np.median(np.abs(away[checked]))
+    ratio = np.hypot(*away.T) / np.hypot(scatter, error)
+    p = np.exp(-(ratio**2) / 2) * np.count_nonzero(others)
+    odd = np.flatnonzero(others & (p < FALSE_ALARM) & (ratio > ratio[checked].max()))
+    names = solution.estimate.star_names
+    return [f"{names[j]} ({np.hypot(*v[j]):.2g} px/yr)" for j in odd[np.argsort(-ratio[odd])]]
+
+
+def _contradictions(solution, observed):
     table, star = observed.table, observed.problem.star
     out = ~np.asarray(table["used"])
     n, lost = np.bincount(star), np.bincount(star, out)

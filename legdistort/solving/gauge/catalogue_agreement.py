@@ -46,7 +46,7 @@ def agreement(equations, stated, used, motions=None):
         bend_chi2=float(max(total - alone.chi2(alone.left(value, used), used), 0)),
         bend_dof=float(dof),
         bend=float(np.sqrt(np.sum(moved**2))) if n_maps == len(covariance) else np.nan,
-        unseen=float(np.sqrt(addition_that_shows(dof) / shown)) if shown > 0 else np.inf,
+        unseen=float(np.sqrt(addition_that_shows(dof) / shown)) if shown * LIMIT**2 > 1 else np.inf,
         years=_years(at_stated, used, left, chi2, motions),
     )
 

@@ -29,6 +29,8 @@ DENSE = 1000
 _ROUNDS = 20
 #: Degrees of freedom below which offsets tell nothing of errors.
 FEWEST = 10
+#: Factor on errors that are to be found, before they are; part of one by which it has settled.
+_TINY, _SETTLED = 1e-6, 0.01
 _CHANCE = 5.0  # standard deviations of chi2 by which chance explains offsets
 _EXACT = 1e-12  # px^2: what counts as known without error
 #: Beginnings of a search for the majority; a median pull, in those expected, up to which chance explains it.
@@ -272,12 +274,21 @@ class MapEquations:
 
     def pulls(self, used):
         """Length of every offset less the map, in its standard errors; those of the used ones without their own say."""
+        return self.lengths(used)(1.0)
+
+    def lengths(self, used):
+        """These lengths as a function of a factor on the errors of the reference, at which the map stays as it is."""
         value, covariance, _ = self.solve(used)
         left, design = self.left(value, used), self.straightened(self.design, used)
         spread = design @ covariance @ design.transpose(0, 2, 1)
         spread = spread + self.bends @ self.bend_covariance(used) @ self.bends.transpose(0, 2, 1)
-        whole = np.where(used[:, None, None], self.blocks - 0.9 * _at_most(spread, self.blocks), self.blocks + spread)
-        return np.sqrt(np.einsum("na,nab,nb->n", left, np.linalg.inv(whole), left))
+
+        def of(factor):
+            blocks = factor**2 * self.offsets.covariance + self.own
+            whole = np.where(used[:, None, None], blocks - 0.9 * _at_most(spread, blocks), blocks + spread)
+            return np.sqrt(np.einsum("na,nab,nb->n", left, np.linalg.inv(whole), left))
+
+        return of
 
     def squares(self, used):
         """Squares of all offsets less the map of the used ones, in their standard errors, and that of the map.
@@ -303,11 +314,12 @@ def _own(relative, star, n, dense):
     return np.array([[xx, xy], [xy, yy]])
 
 
-def accepted(equations, label, near=None):
+def accepted(equations, label, near=None, *, found=False):
     """Which offsets are no mismatches.
 
     Where not all are as expected, those of the majority that agrees best (least trimmed squares: Rousseeuw & Van
-    Driessen 2006), and then all others that agree with these.
+    Driessen 2006), and then all others that agree with these, at errors of the reference with which their median is as
+    expected. A factor on both errors would take the best measured stars for mismatches, whose own are the least.
 
     Parameters
     ----------
@@ -316,6 +328,8 @@ def accepted(equations, label, near=None):
         How messages call the reference.
     near : ndarray of bool, shape (n,), optional
         Those of equations that hardly differ.
+    found : bool
+        Whether errors of the reference are sought: else they are as stated at least.
 
     Raises
     ------
@@ -326,18 +340,21 @@ def accepted(equations, label, near=None):
     used = np.ones(n, dtype=bool)
     if n < 3:
         return used
-    pull = equations.pulls(used)
+    factor = least = _TINY if found else 1.0
+    there = offered = equations.times(least)
+    pull = there.pulls(used)
     if pull.max() <= CLIP and np.median(pull) < _USUAL * _SQRT:
         return used
-    used = _majority(equations) if near is None else near
+    used = _majority(there) if near is None else near
     for count in range(_ROUNDS):
-        pull = equations.pulls(used)
-        of_scale = pull[used] if count or near is not None else pull  # those that agree best are no fair sample
-        scale = max(1.0, np.median(of_scale) / _SQRT)
-        agrees = pull <= scale * _limit(pull / scale, used)
-        if np.array_equal(agrees, used):
+        lengths, before = there.lengths(used), factor
+        of_scale = used if count or near is not None else slice(None)  # those that agree best are no fair sample
+        factor = before * _factor_of(lengths, of_scale, least / before)
+        pull = lengths(factor / before)
+        agrees = pull <= _limit(pull, used)
+        if np.array_equal(agrees, used) and abs(factor / before - 1) < _SETTLED:
             break
-        used = agrees
+        used, there = agrees, _as_far_from_prior(offered, factor / least)
         if 2 * np.count_nonzero(used) < n:
             raise InputError(
                 f"most of the {n} stars that {label} shares with the exposures lie elsewhere in it: other stars under "
@@ -346,13 +363,41 @@ def accepted(equations, label, near=None):
     return used
 
 
+def _as_far_from_prior(equations, factor):
+    """Equations with errors of the reference larger by a factor, whose map is no nearer to what the prior says of it.
+
+    Else a reference that contradicts the prior, which is bent, would have ever larger errors.
+    """
+    out = equations.times(factor)
+    share = np.einsum("naa->", out.precision) / np.einsum("naa->", equations.precision)
+    out.prior = replace(out.prior, information=share * out.prior.information)
+    return out
+
+
+def _factor_of(lengths, which, least):
+    """The factor on the errors of a reference, no smaller than the `least`, by which the median length is as expected.
+
+    `lengths` are those of `MapEquations`, and `which` of them make the median.
+    """
+
+    def excess(log_factor):
+        return np.median(lengths(np.exp(log_factor))[which]) - _SQRT
+
+    low = high = np.log(least)
+    if not excess(low) > 0:
+        return least
+    while excess(high) > 0:
+        low, high = high, high + 1
+    return float(np.exp(brentq(excess, low, high, xtol=1e-3)))
+
+
 def _limit(pull, used):
     """From which pull an offset is rather one of the mismatches: the nearer, the more of these there are.
 
-    They are taken to be normally distributed like those that are known.
+    They are taken to be normally distributed like those that are known, of which one at least is one by itself.
     """
     n_lost = np.count_nonzero(~used)
-    if n_lost < _SEVERAL:
+    if n_lost < _SEVERAL or pull[~used].max() <= CLIP:
         return CLIP
     share, size = n_lost / len(used), np.median(pull[~used]) / _SQRT
     return min(np.sqrt(max(2 * np.log((1 - share) / share * max(size, 1) ** 2), _LEAST**2)), CLIP)

@@ -5,29 +5,34 @@ would change their poses, by a shift, a rotation and a scale that depend on wher
 the values v of the constraints (`Reduced.resistance`), shift, rotation and scale of the plane among them. What the
 scatter of single exposures says of the common map (`legdistort.solving.gauge.hierarchy`), ``v = 0`` with the covariance
 W that follows from that of the map, is independent of it: the constraints are held at the minimum of both, and the
-error of the map is that of both. The same holds where J knows stars, not poses.
+error of the map is that of both. The same holds where J knows stars, not poses; and for the maps that change with time
+where it knows how the motions of stars scatter.
 """
 
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from ..equations import criterion, effective_modes
 from ..equations.criterion import complement
 
 #: Departures of poses from those known are said from so many standard deviations of their squares on.
 _ODD = 5.0
-_SMALLEST = 1e-6  # scatter, pixels: at a start there may be none
+_SMALLEST = 1e-5  # scatter, pixels: at a start there may be none
 
 
-def balanced(system, gauge, violation):
-    """By how much to change the values (n_constraints,) of the constraints, which are now off by a violation."""
-    prior, (information, pull) = _of_scatter(gauge), system.resistance()
-    return np.linalg.solve(information + prior, pull - prior @ violation)
+def balanced(system, gauge, violation, *, plane):
+    """By how much to change the values (n_constraints,) of the constraints, which are now off by a violation.
+
+    The `plane` is where J knows it, or else where the convention has it; maps that change with time are between both.
+    """
+    prior, (information, pull) = _of_scatter(gauge, plane), system.resistance()
+    return np.linalg.solve(information + prior + _of_pointing(gauge, plane), pull - prior @ violation)
 
 
-def determined(system, gauge, violation):
-    """The `Gauge` with constraints held where they are, and the common map with its shift, rotation and scale.
+def determined(system, gauge, violation, *, plane):
+    """The `Gauge` with constraints held where they are, and the maps that J knows, of the `plane` too or drifts alone.
 
     Parameters
     ----------
@@ -37,22 +42,48 @@ def determined(system, gauge, violation):
         As the scatter of exposures has it.
     violation : ndarray, shape (n_constraints,)
     """
-    back = np.linalg.pinv(gauge.reach)
-    covariance = back @ np.linalg.inv(system.resistance()[0] + _of_scatter(gauge)) @ back.T
+    n, back = 2 * gauge.n_modes, np.linalg.pinv(_reach(gauge))
+    information = system.resistance()[0] + _of_scatter(gauge, plane) + _of_pointing(gauge, plane)
+    covariance = back @ np.linalg.inv(information) @ back.T
     covariance = (covariance + covariance.T) / 2
-    return replace(gauge, values=violation, covariance=covariance, unknown_maps=(), poses_known=True)
+    if plane:
+        gauge = replace(gauge, covariance=covariance[:n, :n], unknown_maps=(), poses_known=True)
+    if len(covariance) > n:
+        maps = gauge.drift.maps.T @ gauge.drift.maps
+        known = {"covariance": maps @ covariance[n:, n:] @ maps, "held": system.problem.terms.is_held}
+        gauge = replace(gauge, drift=replace(gauge.drift, **known))
+    return replace(gauge, values=violation)
 
 
-def _of_scatter(gauge):
+def _reach(gauge):
+    """How maps, those that change with time too, change the constraints, (n_constraints, 2 n_modes + q)."""
+    return gauge.orthonormal @ gauge.all_motion.reshape(gauge.orthonormal.shape[1], -1)
+
+
+def _of_scatter(gauge, plane):
     """What the scatter of single exposures says of the values of the constraints, W^-1 (n_constraints,) squared.
 
-    Nothing of shift, rotation and scale, and of maps that are unknown without J.
+    Nothing of shift, rotation and scale, and their rates, and, where J knows the plane, of maps that are unknown
+    without it. Where J does not know the plane, this is exactly where the convention has it.
     """
-    similar = gauge.plane_modes().similar.T
-    free = gauge.reach @ np.column_stack([similar, *(each.map for each in gauge.unknown_maps)])
-    known = complement(np.linalg.qr(free)[0].T)
-    spread = known @ gauge.reach
-    return known.T @ np.linalg.solve(spread @ gauge.covariance @ spread.T + _SMALLEST**2 * np.eye(len(known)), known)
+    reach, drift, n = _reach(gauge), gauge.drift, 2 * gauge.n_modes
+    maps, covariance = [gauge.plane_modes().similar.T], np.zeros((n, n))
+    if plane:
+        maps, covariance = maps + [each.map[:, None] for each in gauge.unknown_maps], gauge.covariance
+    free = np.pad(np.hstack(maps), ((0, reach.shape[1] - n), (0, 0)))
+    if drift is not None:
+        covariance = block_diag(covariance, drift.covariance)
+        free = np.hstack([free, np.pad(drift.rates.T, ((n, 0), (0, 0)))])
+    known = complement(np.linalg.qr(reach @ free)[0].T)
+    spread = known @ reach
+    return known.T @ np.linalg.solve(spread @ covariance @ spread.T + _SMALLEST**2 * np.eye(len(known)), known)
+
+
+def _of_pointing(gauge, plane):
+    """What keeps steps from a shift, rotation and scale of the plane, as `_of_scatter`; nothing where J knows these."""
+    back = np.linalg.pinv(_reach(gauge))
+    rows = gauge.plane_modes().similar @ back[: 2 * gauge.n_modes]
+    return (not plane) * rows.T @ rows / _SMALLEST**2
 
 
 def contradiction(problem, state, uncertainty, fields=None):

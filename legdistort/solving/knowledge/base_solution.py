@@ -8,6 +8,7 @@ from ...exceptions import InputError
 from ...inputs.repetitions import fingerprints
 from ...matching.further_exposures import with_further
 from ...matching.matches import Matches
+from ...priors.prior import Prior
 from ...results.settings import Settings
 from ...results.solution import Solution
 from ...runtime.provenance import now
@@ -55,7 +56,7 @@ def _check(base, given):
             raise InputError(f"nothing can be added to the base, {why}: solve all exposures together")
     internal = (settings.prior or {}).get("source") == f"camera {base.camera.name}"
     needed = {
-        "prior": settings.prior is not None and not internal and settings.model is None,
+        "prior": settings.prior is not None and not internal and settings.model is None and _sizes(settings) is None,
         "model": settings.model is not None,
         "reference": base.diagnostics.reference is not None,
     }
@@ -70,7 +71,15 @@ def _check(base, given):
 def _options(base):
     """The arguments of `solve` that the base was made with."""
     left = _NOT_KEPT | {"degree"} if base.settings.model is not None else _NOT_KEPT  # which a model has
-    return {each.name: getattr(base.settings, each.name) for each in fields(Settings) if each.name not in left}
+    kept = {each.name: getattr(base.settings, each.name) for each in fields(Settings) if each.name not in left}
+    return kept | {"prior": _sizes(base.settings)}
+
+
+def _sizes(settings):
+    """The prior of settings that states sizes alone, of which the description is all; None for another one, or none."""
+    if settings.prior is None or settings.prior["degree"] is not None:
+        return None
+    return Prior(None, sigma=settings.prior["sigma"], static_sigma=settings.prior["static_sigma"])
 
 
 def _log(base, matches):

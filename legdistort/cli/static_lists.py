@@ -1,0 +1,100 @@
+"""Lists of positions that a camera, or another known static distortion, corrects without a solution."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import legdistort
+
+from ..exceptions import InputError
+from ..inputs.star_lists.formats import stack
+from ..inputs.table_files import told_apart
+from ..runtime.asdf_files import entry_of, read_tree
+from .given_files import read_given, without_options_of_prior
+
+#: What the table says of the correction, in its ``meta``.
+_FIGURES = "static_error_px", "exposure_scatter_px"
+_OURS = "legdistort_nights", "legdistort_camera", "legdistort_prior"
+
+
+@dataclass(frozen=True, eq=False)
+class GivenStatic:
+    """A static distortion that was given in the place of a solution.
+
+    Attributes
+    ----------
+    known : Camera or Prior
+    what : str
+        What it is, and of when.
+    scatter : dict
+        Further arguments of its `correct_table`.
+    """
+
+    known: object
+    what: str
+    scatter: dict = field(default_factory=dict)
+
+    def corrected(self, a):
+        """The lists of a command line, one below the other, corrected; in words by what and how well; the figures."""
+        lists = told_apart([(Path(path), read_given(path, a)) for path in a.tables])
+        if a.detector is not None:
+            if not isinstance(self.known, legdistort.Camera):
+                raise InputError("--detector is for a camera: leave it out, this static distortion is of one detector")
+            self.known[a.detector]  # refuses an unknown one
+        made = []
+        for path, table in lists.items():
+            try:
+                made.append(self._corrected(table, a.detector))
+            except InputError as error:
+                raise InputError(f"{path}: {error}") from None
+        out = stack(made)
+        out.meta |= {name: _joint([each.meta[name] for each in made], list(map(len, made))) for name in _FIGURES}
+        return out, self._described(out), {name: out.meta[name] for name in _FIGURES}
+
+    def _corrected(self, table, detector):
+        if detector is not None:
+            if "detector" in table.colnames:
+                raise InputError("it has a column detector, which says it of every row: leave --detector out")
+            table["detector"] = detector
+        return self.known.correct_table(table, **self.scatter)
+
+    def _described(self, table):
+        """What corrected the positions of a table, and how good it is there."""
+        error, scatter = map(table.meta.get, _FIGURES)
+        lost = sum(table["x_err_abs"].value != table["x_err_abs"].value)
+        said = "states no error, and counts as exact" if error == 0 else f"is known to {error or 0:.2g} px rms per axis"
+        if lost:
+            rest = f", of the others to {error:.2g} px rms per axis" if error else ""
+            said = f"is not known of {lost} of them (x_err_abs is nan){rest}"
+        about = f"exposures scatter about it by {scatter or 0:.2g} px"
+        about = about if scatter else "how far exposures scatter about it is not stated"
+        return f", without the static distortion of {self.what}, which {said}; {about}"
+
+
+def given_static(where, a):
+    """The `GivenStatic` in a file, or by a name, as ``--prior`` takes it; None for a solution."""
+    if Path(where).is_dir() or entry_of(where, ["legdistort"]) is not None:
+        return None
+    entry = entry_of(where, _OURS)
+    if entry is None or entry == "legdistort_prior":
+        with without_options_of_prior(a):
+            return GivenStatic(legdistort.Prior.from_file(where), f"{where}{_written(where, entry)}")
+    camera = legdistort.Camera.read(where)
+    if entry == "legdistort_camera":
+        return GivenStatic(camera, f"camera {camera.name} ({where}){_written(where, entry)}")
+    nights = legdistort.CombinedNights.read(where)
+    dates = sorted({f"{date:.2f}" for date in (nights.dates.min(), nights.dates.max()) if date})
+    count = sum(each.n_nights for each in nights.nights)
+    what = f"camera {camera.name} ({where}) of {count} night{'s' * (count > 1)}{', ' * bool(dates)}{' to '.join(dates)}"
+    return GivenStatic(camera, what, {"sigma": nights.prior(one_exposure=True).sigma})
+
+
+def _written(where, entry):
+    """When a file of ours was written; nothing of another one."""
+    created = read_tree(where)[entry].get("provenance", {}).get("created") if entry else None
+    return f", written {str(created)[:10]}" if created else ""
+
+
+def _joint(sizes, count):
+    """Root mean square of some that are known, of numbers of positions; None without any."""
+    known = [(size, n) for size, n in zip(sizes, count, strict=True) if size is not None]
+    return (sum(size**2 * n for size, n in known) / sum(n for _, n in known)) ** 0.5 if known else None
