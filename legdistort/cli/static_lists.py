@@ -5,7 +5,7 @@ from pathlib import Path
 
 import legdistort
 
-from ..exceptions import InputError
+from ..exceptions import InputError, some_of
 from ..inputs.star_lists.formats import stack
 from ..inputs.table_files import told_apart
 from ..runtime.asdf_files import entry_of, read_tree
@@ -13,6 +13,7 @@ from .given_files import read_given, without_options_of_prior
 
 #: What the table says of the correction, in its ``meta``.
 _FIGURES = "static_error_px", "exposure_scatter_px"
+_MOST_NAMED = 3  # lists in a message
 _OURS = "legdistort_nights", "legdistort_camera", "legdistort_prior"
 
 
@@ -46,9 +47,13 @@ class GivenStatic:
                 made.append(self._corrected(table, a.detector))
             except InputError as error:
                 raise InputError(f"{path}: {error}") from None
+        bare = [str(path) for path, table in lists.items() if "x_err" not in table.colnames]
         out = stack(made)
         out.meta |= {name: _joint([each.meta[name] for each in made], list(map(len, made))) for name in _FIGURES}
-        return out, self._described(out), {name: out.meta[name] for name in _FIGURES}
+        words = self._described(out)
+        if bare:
+            words += f"; {some_of(bare, _MOST_NAMED)} without errors of the positions, which x_err leaves out: --error"
+        return out, words, {name: out.meta[name] for name in _FIGURES}
 
     def _corrected(self, table, detector):
         if detector is not None:

@@ -191,12 +191,14 @@ def _on_plane(reference, plane, positions, flux):
     size = (high - low).max()
     near = np.flatnonzero(np.all((plane > low - _MARGIN * size) & (plane < high + _MARGIN * size), axis=1))
     if len(near):
-        found = _registered(positions, plane[near], flux, reference.flux, near, guess=True)
-        if found is None:
-            found = _neighbours(positions, plane[near], high - low)
         inside = np.all((plane[near] > low) & (plane[near] < high), axis=1)
-        if len(found[0]) > np.count_nonzero(inside) / 2:  # of what is another field a few are near by chance
-            return found[0], near[found[1]]
+        for given in (flux, None) if flux is not None and reference.flux is not None else (None,):
+            # brightest stars first is faster, and may end in a few that agree by chance
+            found = _registered(positions, plane[near], given, reference.flux, near, guess=True)
+            if found is None:
+                found = _neighbours(positions, plane[near], high - low)
+            if len(found[0]) > np.count_nonzero(inside) / 2:  # of what is another field a few are near by chance
+                return found[0], near[found[1]]
     distance = np.nanmin(cKDTree(positions).query(np.nan_to_num(plane, nan=1e9))[0], initial=np.inf)
     raise InputError(
         f"none of the {len(plane)} stars of {reference.label} lies where a star of the exposures is"

@@ -16,10 +16,15 @@ from scipy.optimize import minimize_scalar
 from ..exceptions import SolveError
 from ..results.diagnostics import MotionScatter
 from . import single_fit, star_motions
+from .equations.elimination import inverse_star_blocks
 from .equations.star_terms import unpacked
 
 log = logging.getLogger(__name__)
 
+#: Variance of motions in that with exposures as exact, from which a weak combination of these makes most of it.
+_COMMON = 4.0
+#: Sizes of the scatter that are tried first.
+_TRIED = 20
 #: Days within which nobody asks whether stars moved.
 _LONG = 365.0
 
@@ -88,8 +93,16 @@ def scatter(fit):
             "are needed at this degree: give motion_sigma"
         )
     scale2 = max(1.0, fit.chi2 / fit.dof) if fit.dof > 0 else 1.0
-    v, c = state.stars[2:4, good].T, scale2 * covariance[good]
+    own = unpacked(inverse_star_blocks(fit.result.blocks.v))[good, 2:4, 2:4] * 2 * n / (2 * n - m)
+    covariance = covariance[good]
+    if np.median(covariance[:, [0, 1], [0, 1]]) > _COMMON * np.median(own[:, [0, 1], [0, 1]]):
+        covariance = own  # nearly all of the errors is common to all stars, and no scatter of theirs
+    v, c = state.stars[2:4, good].T, scale2 * covariance
     design = np.kron(np.eye(2), values.T).reshape(2, n, m).transpose(1, 0, 2)
+    # a map common to all, which nothing but widths may hold, can be larger than any motion by orders of magnitude
+    root = np.linalg.cholesky(np.linalg.inv(c)).mT
+    flat = (root @ design).reshape(2 * n, m)
+    v = v - design @ np.linalg.lstsq(flat, (root @ v[:, :, None]).ravel(), rcond=None)[0]
 
     def deviance(sigma):
         precision = np.linalg.inv(c + sigma**2 * np.eye(2))
@@ -101,6 +114,9 @@ def scatter(fit):
 
     size = np.sqrt(np.median(np.einsum("jaa->ja", c)))
     top = np.log(10 * np.sqrt(np.mean(v**2)) / size + 10)
-    found = minimize_scalar(lambda log_s: deviance(size * np.exp(log_s)), bounds=(-6, top), method="bounded")
+    tried = np.linspace(-6, top, _TRIED)  # the likelihood may be flat on both sides of its maximum
+    best = np.argmin([deviance(size * np.exp(each)) for each in tried])
+    bounds = tried[max(best - 1, 0)], tried[min(best + 1, _TRIED - 1)]
+    found = minimize_scalar(lambda log_s: deviance(size * np.exp(log_s)), bounds=bounds, method="bounded")
     gain = max(deviance(0.0) - found.fun, 0.0)
     return MotionScatter(float(size * np.exp(found.x)) if gain > 0 else 0.0, float(gain), n)

@@ -43,6 +43,18 @@ def test_a_common_shift_of_a_short_catalogue_is_found_among_many_stars(seed):
     np.testing.assert_array_equal(have, wanted)
 
 
+@pytest.mark.parametrize("seed", [16, 23])
+def test_fluxes_that_mislead_do_no_harm(seed):
+    """Of another band, say: with these alone nothing was found."""
+    positions, reference, rows = deep(seed)
+    rng = np.random.default_rng(100 + seed)
+    table = Table({"x": reference.xy[:, 0], "y": reference.xy[:, 1], "flux": 10 ** rng.uniform(2, 5, len(rows))})
+    table["x_err"] = table["y_err"] = 0.1
+    flux = 10 ** rng.uniform(2, 5, len(positions))
+    found = identify(read_reference(table), np.arange(len(positions)), positions, flux=flux)
+    assert set(rows[rows >= 0]) <= set(found.rows)
+
+
 def none_found(seeds, **setting):
     for seed in seeds:
         positions, reference, _ = deep(seed, chance=True, **setting)

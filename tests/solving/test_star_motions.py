@@ -105,6 +105,17 @@ def test_stars_and_exposures_hold_the_map_of_motions_by_their_weights(single, mo
         assert least * free < held < most * free
 
 
+@pytest.mark.parametrize(("seed", "motion"), [(0, 0.02), (1, 0.0), pytest.param(2, 0.02, marks=pytest.mark.slow)])
+def test_motions_show_between_two_nights_that_are_turned(seed, motion):
+    """What both leave open is a map of all motions, 10 times as large as one: no scatter of motions hides in that."""
+    nights = Nights(seed, nights=2, per=5, nightly=0.0, single=0.003, motion=motion, roll=60.0)
+    solution = solve(Matches.from_table(nights.table, shape=(SIZE, SIZE)), motion="auto")
+    found = solution.diagnostics.motion_scatter
+    assert found.is_there == (motion > 0)
+    assert found.sigma == pytest.approx(motion, rel=0.15, abs=0.003)
+    assert solution.chi2 / solution.dof < 1.1
+
+
 def test_a_star_that_two_epochs_have_move_unlike_all_others_is_named():
     """One of its positions is that of another star, and no third one tells."""
     nights = Nights(2, nights=4, per=2, n_stars=60, motion=0.3, roll=0.7)
