@@ -63,7 +63,7 @@ def with_cures(checks, solution, residuals, observed, judged):
     if static is not None and any(checks[name].state in WRONG for name in _BY_DEGREE):
         higher, ends, after = _higher_degree(residuals, static)
         if ends and judged(after)["chi2"].state not in WRONG:  # then it is the degree and no more
-            return _with_static_degree(checks, f"{_before_degree(solution)}{higher}")
+            return _with_static_degree(checks, _or_layout(solution, higher))
     effects = effects_in(residuals, observed)
     checks, explained = _named(checks, effects, judged, static=solution.settings.static)
     wrong = [name for name, check in checks.items() if check.state in WRONG and name not in explained]
@@ -103,13 +103,15 @@ def _with_static_degree(checks, higher):
     return checks | {name: replace(checks[name], sentence=sentences[name], cure=higher) for name in names}, names
 
 
-def _before_degree(solution):
-    """What to try before a higher degree of static distortions: they bend for a layout that is wrong, if it is held."""
+def _or_layout(solution, higher):
+    """The cure by a higher degree of static distortions, and by the layout, if it is held: they bend for a wrong one."""
     errors = solution.estimate.uncertainty.camera
     if len(solution.camera.detectors) < 2 or errors is None or errors.free[:, :, :3].any():
-        return ""
-    instead = " in place of --layout hold" * (solution.settings.layout == "hold")
-    return f"--layout fit{instead}, if the layout may be wrong (static distortions bend for it); else "
+        return higher
+    if solution.settings.layout == "hold":
+        words = "--layout fit in place of --layout hold, if the layout may be wrong (static distortions bend for it)"
+        return f"{words}; else {higher}"
+    return f"{higher}; first --layout fit, if the layout may be wrong (static distortions bend for it)"
 
 
 def without_static(solution):
