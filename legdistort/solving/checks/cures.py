@@ -104,7 +104,7 @@ def _with_static_degree(checks, higher):
 
 
 def _or_layout(solution, higher):
-    """The cure by a higher degree of static distortions, and by the layout, if it is held: they bend for a wrong one."""
+    """The cure by a higher degree of static distortions, and by the layout, if that is held: a wrong one bends them."""
     errors = solution.estimate.uncertainty.camera
     if len(solution.camera.detectors) < 2 or errors is None or errors.free[:, :, :3].any():
         return higher
