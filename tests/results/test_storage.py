@@ -69,10 +69,12 @@ def with_sky():
 
 
 def assert_same_table(a, b):
+    """But for the last digit of columns made of what a file holds: it depends on where arrays lie in memory."""
     assert a.colnames == b.colnames
     for name in a.colnames:
         if name != "sky":  # made of ra and dec
-            assert_array_equal(a[name], b[name])
+            one, two = (np.asarray(each[name]) for each in (a, b))
+            assert_allclose(one, two, rtol=1e-14) if one.dtype.kind == "f" else assert_array_equal(one, two)
         assert getattr(a[name], "unit", None) == getattr(b[name], "unit", None)
 
 
