@@ -213,20 +213,9 @@ class _Means:
             odd |= {worst}
         return [tests[k] if k in tests else self._test(k, odd - {k}, alarm) for k in range(n)]
 
-    def _factor(self, out):
-        """What is known of the departures, those of some nights but that they are free, and of S."""
-        n, k = self.values.shape
-        static = sparse.kron(np.ones((n, 1)), -np.eye(k))
-        size = np.where(np.isin(np.arange(n), list(out))[:, None], GIVEN, self.degrees - 1).ravel()
-        rows = sparse.hstack([sparse.eye_array(n * k), static], format="csr")
-        own = Factor("departures of nights", rows, self.values.ravel(), np.full(n * k, _FREE), size)
-        rows = sparse.eye_array(k, (n + 1) * k, k=n * k, format="csr")
-        free = Factor("static distortion", rows, np.zeros(k), np.full(k, _FREE), np.full(k, GIVEN))
-        return Factor.joined([own, free])
-
     def _posterior(self, out, sizes=None):
         """Of the nights that are not left out; at given sizes, or those that make them most likely."""
-        data, factor = self.data, self._factor(out)
+        data, factor = self.data, _about_one("nights", self.values, self.degrees, free=out)
         if sizes is not None:
             return Posterior(data, factor, sizes)
         unit = _unit(data)
@@ -322,6 +311,19 @@ def _chance(away, covariance, dof, even):
     return special.fdtrc(even * m, even * dof, square / m) if even * dof >= 1 else 1.0
 
 
+def _about_one(of, values, degrees, free=()):
+    """The factor on departures of values (n, K) from what they have in common, by degree, and on that, which is free.
+
+    So are those of some of them, by number.
+    """
+    n, k = values.shape
+    size = np.where(np.isin(np.arange(n), list(free))[:, None], GIVEN, degrees - 1).ravel()
+    rows = sparse.hstack([sparse.eye_array(n * k), sparse.kron(np.ones((n, 1)), -np.eye(k))], format="csr")
+    own = Factor(f"departures of {of}", rows, values.ravel(), np.full(n * k, _FREE), size)
+    rows = sparse.eye_array(k, (n + 1) * k, k=n * k, format="csr")
+    return Factor.joined([own, Factor(f"what {of} share", rows, np.zeros(k), np.full(k, _FREE), np.full(k, GIVEN))])
+
+
 def _unit(data):
     """Typical error of a coefficient of data [pix]."""
     return 1 / np.sqrt(np.median(np.diag(data.curvature)))
@@ -339,16 +341,7 @@ def _within(data, apart, owner, degrees):
         mine = np.flatnonzero(owner == night)
         rows = (mine[:, None] * k + np.arange(k)).ravel()
         part = ReducedData(data.curvature[np.ix_(rows, rows)], data.pull[rows], 0.0, len(rows))
-        departures = sparse.hstack(
-            [sparse.eye_array(len(rows)), sparse.kron(np.ones((len(mine), 1)), -np.eye(k))], format="csr"
-        )
-        mean = sparse.eye_array(k, len(rows) + k, k=len(rows), format="csr")
-        value, size = apart[mine].ravel(), np.tile(degrees - 1, len(mine))
-        factor = Factor.joined([
-            Factor("departures of the exposures", departures, value, np.ones(len(value)), size),
-            Factor("departure of the night", mean, np.zeros(k), np.full(k, _FREE), np.full(k, GIVEN)),
-        ])  # fmt: skip
-        unit = _unit(part)
+        factor, unit = _about_one("exposures", apart[mine], degrees), _unit(part)
         own[night] = most_likely(part, factor, np.full(most, 3 * unit), unit * np.array(RANGE)).sizes ** 2
     free, others = (count - 1)[:, None], ~np.eye(len(count), dtype=bool)
     theirs = others @ (free * own) / np.maximum(others @ free, 1)

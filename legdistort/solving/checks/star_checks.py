@@ -3,6 +3,7 @@
 import numpy as np
 from scipy import special
 
+from ...exceptions import some_of
 from ...results.check import FALSE_ALARM, Check
 from ..equations.elimination import inverse_star_blocks
 from .limits import MOST_NAMED
@@ -42,7 +43,7 @@ def stars_check(solution, observed):
     check, found = _contradictions(solution, observed), _unlike(solution)
     if not found:
         return check
-    named = ", ".join(found[:MOST_NAMED]) + f" and {len(found) - MOST_NAMED} more" * (len(found) > MOST_NAMED)
+    named = some_of(found, MOST_NAMED)
     move, seen = ("moves", "it was seen") if len(found) == 1 else ("move", "they were seen")
     said = (
         f"{_counted(len(found))} {move} unlike all others, and nothing checks that, {seen} at two epochs only: {named}"
@@ -75,6 +76,7 @@ def _unlike(solution):
 
 
 def _contradictions(solution, observed):
+    """The check of observations of one star."""
     table, star = observed.table, observed.problem.star
     out = ~np.asarray(table["used"])
     n, lost = np.bincount(star), np.bincount(star, out)

@@ -41,6 +41,8 @@ def determined(system, gauge, violation, *, plane):
     gauge : Gauge
         As the scatter of exposures has it.
     violation : ndarray, shape (n_constraints,)
+    plane : bool
+        Whether J knows where the plane is.
     """
     n, back = 2 * gauge.n_modes, np.linalg.pinv(_reach(gauge))
     information = system.resistance()[0] + _of_scatter(gauge, plane) + _of_pointing(gauge, plane)
@@ -81,9 +83,11 @@ def _of_scatter(gauge, plane):
 
 def _of_pointing(gauge, plane):
     """What keeps steps from a shift, rotation and scale of the plane, as `_of_scatter`; nothing where J knows these."""
+    if plane:
+        return 0.0
     back = np.linalg.pinv(_reach(gauge))
     rows = gauge.plane_modes().similar @ back[: 2 * gauge.n_modes]
-    return (not plane) * rows.T @ rows / _SMALLEST**2
+    return rows.T @ rows / _SMALLEST**2
 
 
 def contradiction(problem, state, uncertainty, fields=None):
