@@ -32,7 +32,7 @@ FRAMES = {
     "paths": Option(
         "FITS files, plain or compressed; ASDF files of Roman", "frames", nargs="+", metavar="FRAME", path="inputs"
     ),
-    "ext": Option("extension: number, name, or NAME,VERSION", type=extension),
+    "ext": Option("extension: number, name, pattern such as 'IM*', or NAME,VERSION", type=extension),
 }
 RUN_FRAMES = {
     "paths": Option(

@@ -164,10 +164,12 @@ def read_exposures(
         A string with ``*`` or ``?`` is expanded if no file has that very name.
     ext : int, str or (str, int), optional
         Extension to read from every file; by default the image, ``SCI`` if one is named so. Planes beside it (``DQ``,
-        ``WHT`` and the like) do not count. A name that several extensions have stands for all of them, the detectors of
-        a camera: each becomes an `Exposure` ``NAME-ID`` with the ``exposure`` NAME and the ``detector`` ID, which is
-        ``CCDCHIP``, ``DETECTOR``, ``CHIP`` or ``EXTVER`` of its header, else ``FRAMEID``, ``CCDNAME`` or their order.
-        Images without a name are taken so by default where each has a ``DETSEC`` of its own, as in raw files of Gemini.
+        ``WHT`` and the like) do not count. A name that several extensions have, or a pattern, ``"IM*"``, stands for all
+        of them, the detectors of a camera: each becomes an `Exposure` ``NAME-ID`` with the ``exposure`` NAME and the
+        ``detector`` ID, which is ``CCDCHIP``, ``DETECTOR``, ``CHIP`` or ``EXTVER`` of its header, else ``EXTNAME``,
+        ``FRAMEID``, ``CCDNAME`` or their order. Images without a name, or whose names differ by a number (``IM1``,
+        ``IM2``), are taken so by default where each has a ``DETSEC`` of its own, as in raw files of Gemini; numbered
+        ones by ``CCDNAME`` or ``DETECTOR`` too.
     dq_good : int, str or sequence of int, optional
         Flags of the DQ plane that are no reason to leave a pixel out, a sum of bits or ``"64,32"``; all others are.
     weight_maps : str, optional
@@ -424,10 +426,7 @@ def _parts(sources, ext):
     """``[(extension, id of the detector)]`` to read from every source; None where it is not one of several."""
     if not (ext is None or isinstance(ext, str)):
         return [[(ext, None)] for _ in sources]
-    parts = images_of_detectors([_headers_of(source) for source in sources], ext)
-    if ext is None and (most := max(map(len, parts))) > 1:
-        log.info("%d images without a name in a file are taken for the detectors of one camera, by DETSEC", most)
-    return parts
+    return images_of_detectors([_headers_of(source) for source in sources], ext)
 
 
 def _headers_of(source):

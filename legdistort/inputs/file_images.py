@@ -1,13 +1,17 @@
 """Which images a FITS file holds: of the sky, of the detectors of a camera, and the planes that stand beside them."""
 
 import contextlib
+import logging
 import re
 from dataclasses import replace
+from fnmatch import fnmatchcase
 
 from astropy.io import fits
 
 from ..exceptions import DamagedError, InputError
 from .exposure_names import detector_name, exposure_name, in_header
+
+log = logging.getLogger(__name__)
 
 #: Header keywords that distinguish detectors, in order of preference.
 KEYWORDS = ("CCDCHIP", "DETECTOR", "CHIP", "EXTVER", "EXTNAME")
@@ -32,13 +36,24 @@ def _numbered(hdulist):
 
 
 def _named(images, ext):
-    """Those of ``{number: HDU}`` with the name asked for."""
-    return {i: hdu for i, hdu in images.items() if isinstance(ext, str) and hdu.name == ext.strip().upper()}
+    """Those of ``{number: HDU}`` with the name asked for; by a pattern, those that are of the sky."""
+    if not isinstance(ext, str):
+        return {}
+    asked = ext.strip().upper()
+    named = {i: hdu for i, hdu in images.items() if hdu.name == asked}
+    if named or not is_pattern(ext):
+        return named
+    return {i: hdu for i, hdu in images.items() if fnmatchcase(hdu.name, asked) and not _stands_beside(hdu.name)}
+
+
+def is_pattern(ext):
+    """Whether an extension asked for is a pattern for names, such as ``IM*``."""
+    return isinstance(ext, str) and any(sign in ext for sign in "*?[")
 
 
 def _forms(named):
-    """``{number: extension}`` of images of one name: by name and ``EXTVER``, or by number where these repeat."""
-    distinct = len({hdu.ver for hdu in named.values()}) == len(named)
+    """``{number: extension}`` of images: by name and ``EXTVER``, or by number where these repeat."""
+    distinct = len({(hdu.name, hdu.ver) for hdu in named.values()}) == len(named)
     return {i: (hdu.name, hdu.ver) if distinct else i for i, hdu in named.items()}
 
 
@@ -70,8 +85,8 @@ def images_of_detectors(files, ext):
     files : list of list of HDU
         All of every file.
     ext : int, str, (str, int) or None
-        The extension asked for; a name may stand for the images of several detectors, and none for those that have no
-        name but each a place in one array of detectors (`are_unnamed_detectors`).
+        The extension asked for; a name, or a pattern for names, may stand for the images of several detectors, and none
+        for those that are told to be detectors (`detectors_of`), which is logged.
 
     Returns
     -------
@@ -79,8 +94,11 @@ def images_of_detectors(files, ext):
         ``[(extension, id)]`` for every file; the id is None where it has but one image and no other file has several.
     """
     single, files = [[(ext, None)] for _ in files], list(map(_numbered, files))
-    if ext is None and any(are_unnamed_detectors(list(images.values())) for images in files):
-        ext = ""
+    if ext is None and (told := [found for images in files if (found := detectors_of(images.values()))]):
+        ext, keyword = told[0]
+        most = max((list(_named(images, ext).values()) for images in files), key=len)
+        which = f"images {most[0].name} to {most[-1].name}" if ext else "images without a name"
+        log.info("%d %s in a file are taken for the detectors of one camera, by %s", len(most), which, keyword)
     if not isinstance(ext, str):
         return single
     found, known = [], set()
@@ -94,16 +112,35 @@ def images_of_detectors(files, ext):
     return [parts or one for parts, one in zip(found, single, strict=True)]
 
 
-def are_unnamed_detectors(images):
-    """Whether images are the detectors of one camera as Gemini writes them: no names, but each a place of its own.
+def detectors_of(images):
+    """What tells that images are the detectors of one camera: their name or pattern, and the keyword; None if nothing.
 
-    They are alike but for the section of the array, ``DETSEC``, and ``EXTVER``, where they have it; the amplifiers of
-    one detector, which have a section each too, share its ``CCDNAME``.
+    They are alike but for a number in their names (``IM1``, ``IM2``), or have none, as raw frames of Gemini, and each
+    has a section of the array, ``DETSEC``, of its own; for numbered ones ``CCDNAME`` or ``DETECTOR`` do as
+    well. The amplifiers of one detector, which have a section each too, share its ``CCDNAME``.
     """
-    if len(images) < 2 or len({plane_shape(hdu) for hdu in images}) > 1 or {hdu.name for hdu in images} != {""}:
-        return False
-    sections, chips = ([hdu.header.get(key) for hdu in images] for key in ("DETSEC", "CCDNAME"))
-    return None not in sections and all(len(set(each)) == len(images) or each[0] is None for each in (sections, chips))
+    images = [hdu for hdu in images if not _stands_beside(hdu.name)]
+    name = _common_name(images)
+    if name is None or len({plane_shape(hdu) for hdu in images}) > 1:
+        return None
+    cards = {key: [hdu.header.get(key) for hdu in images] for key in ("DETSEC", "CCDNAME", "DETECTOR")}
+    own = [key for key, each in cards.items() if None not in each and len(set(each)) == len(images)]
+    if cards["CCDNAME"][0] is not None and "CCDNAME" not in own:
+        return None
+    own = own if name else [key for key in own if key == "DETSEC"]
+    return (name, own[0]) if own else None
+
+
+def _common_name(images):
+    """Pattern for names of images that differ by a number at their end, "" if none has a name; else None."""
+    names = [hdu.name for hdu in images]
+    stems = {name.rstrip("0123456789") for name in names}
+    if len(names) < 2 or len(stems) > 1:
+        return None
+    if set(names) == {""}:
+        return ""
+    stem = stems.pop()
+    return f"{stem}[0-9]*" if stem and stem not in names and len(set(names)) == len(names) else None
 
 
 def _every_id(images, ext):
@@ -136,6 +173,8 @@ def detector_names(hdulist, path, ext=None):
     """``{name of an exposure: extension}`` for every way to name the detectors of a file, of one extension or all."""
     images = {i: hdu for i, hdu in _numbered(hdulist).items() if not _stands_beside(hdu.name)}
     kinds = {hdu.name for hdu in images.values()} if ext is None else {ext}
+    if ext is None and (told := detectors_of(images.values())):
+        kinds = *kinds, told[0]
     forms = [part for kind in kinds for part in _every_id(images, kind) + _parts(_named(images, kind))]
     return {detector_name(exposure_name(path), key): form for form, key in forms}  # the last, as they are read
 
@@ -218,11 +257,13 @@ def find_image(hdulist, ext, label, *, of_several=False):
     where = "" if ext is None else f" in extension {ext!r}"
     if ext is not None:
         try:
-            candidates = [hdulist[ext]]
+            candidates = list(_named(_numbered(hdulist), ext).values()) if is_pattern(ext) else [hdulist[ext]]
+            candidates[0]
         except (KeyError, IndexError):
             present = ", ".join(f"{i} {h.name}".strip() for i, h in enumerate(hdulist))
-            alike = are_unnamed_detectors([hdu for hdu in hdulist if is_image(hdu)])
-            cure = "; its images have no name: leave ext (--ext) out to read all detectors" * alike
+            told = detectors_of([hdu for hdu in hdulist if is_image(hdu)])
+            have = "are numbered" if told and told[0] else "have no name"
+            cure = f"; its images {have}: leave ext (--ext) out to read all detectors" * (told is not None)
             raise DamagedError(f"{label}: no extension {ext!r}; the file has {present}{cure}") from None
         candidates = [hdu for hdu in candidates if is_image(hdu)]
     else:
@@ -261,7 +302,8 @@ def _listed_images(hdulist, images):
     python = f"({name!r}, {version})" if comma else name
     listed_so = f"{len(images)} images, {', '.join(named)}{more} (ny, nx)"
     advice = f"choose one, such as ext={python} (--ext {forms[0]})"
-    if len({hdu.name for hdu in images}) == 1:
-        every = images[0].name
-        advice += f", or take all as the detectors of one camera, ext={every!r} (--ext {every or repr(every)})"
+    every = images[0].name if len({hdu.name for hdu in images}) == 1 else _common_name(images)
+    if every is not None:
+        quoted = every if every.isalnum() else repr(every)
+        advice += f", or take all as the detectors of one camera, ext={every!r} (--ext {quoted})"
     return f"{listed_so}: {advice}"

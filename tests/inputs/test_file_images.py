@@ -98,6 +98,44 @@ def test_detectors_without_versions_are_read_by_their_number(tmp_path, ids, name
         assert all(find_image(hdulist, forms[each.name], "raw") is hdulist[k + 1] for k, each in enumerate(found))
 
 
+@pytest.mark.parametrize("versions", [(1, 2, 3, 4), (1, 1, 1, 1)])
+@pytest.mark.parametrize("ext", [None, "IM*"])
+def test_numbered_images_are_detectors_by_their_sections(tmp_path, caplog, versions, ext):
+    """IM1 to IM4, as pipelines name them: by themselves, or by a pattern, with planes beside them."""
+    path = gemini_file(tmp_path / "S1.fits", names=["IM1", "IM2", "IM3", "IM4"])
+    with fits.open(path, mode="update") as hdulist:
+        for hdu, version in zip(hdulist[1:], versions, strict=True):
+            hdu.ver = version
+        hdulist.append(fits.ImageHDU(np.zeros(SHAPE, "int16"), name="DQ1"))
+    with caplog.at_level("INFO"):
+        found = ld.open_exposures(path, ext=ext)
+    told = "4 images IM1 to IM4 in a file are taken for the detectors of one camera, by DETSEC" in caplog.text
+    assert told == (ext is None)
+    ids = [str(k) if len(set(versions)) > 1 else f"IM{k}" for k in (1, 2, 3, 4)]
+    assert [each.name for each in found] == [f"S1-{key}" for key in ids]
+    assert {each.exposure for each in found} == {"S1"}
+    for k, each in enumerate(found):
+        assert_array_equal(each.read().data, pixels(k))
+    with fits.open(path) as hdulist:
+        forms = detector_names(hdulist, path, ext)
+        assert all(find_image(hdulist, forms[each.name], "raw") is hdulist[k + 1] for k, each in enumerate(found))
+
+
+def test_numbered_images_that_nothing_places_are_asked_for(tmp_path):
+    """Amplifiers of two detectors, and images without sections: the pattern that takes them all is advised."""
+    names = ["IM1", "IM2", "IM3", "IM4"]
+    amplifiers = gemini_file(tmp_path / "amps.fits", names=names, chips="1122")
+    plain = mosaic_file(tmp_path / "plain.fits", *((name, 1) for name in names))
+    for path in (amplifiers, plain):
+        with pytest.raises(InputError, match=r"take all as the detectors .*, ext='(IM.*)' \(--ext 'IM.*'\)"):
+            ld.read_exposures(path)
+        assert len(ld.read_exposures(path, ext="IM*")) == 4
+    (one,) = ld.read_exposures(plain, ext="*M3")
+    assert_array_equal(one.data, pixels(2))
+    with pytest.raises(InputError, match=r"no extension 'CCD\*'"):
+        ld.read_exposures(plain, ext="CCD*")
+
+
 def test_images_of_one_name_and_version_are_all_read(tmp_path):
     """Never one of them in silence: as the detectors 1, 2, ..., since nothing else tells them apart."""
     path = mosaic_file(tmp_path / "mef.fits", ("S", 1), ("S", 1))
