@@ -46,7 +46,10 @@ def geometries():
             poses={name: np.column_stack([rotation, middle - rotation @ middle + shift]) for name in names},
             coefficients=coefficients,
             estimate=dataclasses.replace(
-                base.estimate, shapes=dict.fromkeys(names, shape), prior_mean=np.zeros_like(coefficients)
+                base.estimate,
+                shapes=dict.fromkeys(names, shape),
+                prior_mean=np.zeros_like(coefficients),
+                checked=(),  # it is no solution of any stars
             ),
             sky=TangentPlane(lon, lat, np.column_stack([m, -m @ middle])),
         )

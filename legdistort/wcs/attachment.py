@@ -170,6 +170,9 @@ def attach(
         )  # fmt: skip
     if unknown := _unknown_sky(solution):
         log.warning("%s", unknown)
+    for check in solution.checks:
+        if check.name == "extrapolation" and check.state != "pass":
+            log.warning("%s; that is so in their WCSs too", check.sentence)
     if alike := [f"{plan.path.name} as {v.name}" for plan in plans for v in map(images.views.get, plan.headers)
                  if _is_another_product(plan.path, v)]:  # fmt: skip
         log.warning("frames are taken for exposures whose names differ by the last word (%d): %s", len(alike),

@@ -13,7 +13,6 @@ import numpy as np
 from scipy import special
 
 from ...exceptions import reasons_of, some_of
-from ...geometry.star_hull import enclosed_area
 from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
 from ...results.errors.header_pointing import CURE as POINTING_CURE
 from ...results.gauge import warning_of
@@ -21,6 +20,7 @@ from ..terms.observed import Observed
 from .camera_check import camera_check, contradicted_layout, undetermined
 from .cures import with_cures, without_static
 from .dynamic_check import EVIDENCE, dynamic_check, nights_check, significance
+from .extrapolated_maps import extrapolation_check
 from .limits import ALIKE, ASKED, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
 from .reference_check import reference_check
@@ -43,7 +43,6 @@ _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degr
 _NO_DOF = "no degrees of freedom are left to judge it by"
 _PASSES = f"passes (chance, or errors right to {100 * NEGLIGIBLE:.0f} %)"
 _TELL_STATIC = "dithers by a good part of the field, or a turned camera, show it"
-_TOO_MUCH = 0.5  # of a frame without stars around
 _SAME = 0.5  # correlation of residuals beyond which two exposures are one: no systematic error is so large
 
 
@@ -93,7 +92,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
             judged=partial(_pattern_state, residuals=residuals),
         ),
         overlaps_check(solution, residuals),
-        extrapolation_check(residuals),
+        extrapolation_check(solution, residuals),
         rejection_check(solution),
         stars_check(solution, observed),
         completeness_check(solution, residuals),
@@ -365,45 +364,6 @@ def _grounds(gauge, others):
     if gauge.poses_known:
         grounds["poses"] = "the errors stated of the poses"
     return " and ".join(grounds.values()) or "dithers and rolls alone"
-
-
-def extrapolation_check(residuals):
-    """How much of a frame lies outside its stars?"""
-    problem = residuals.problem
-    shares, numbers = np.ones(problem.n_exposures), np.zeros(problem.n_exposures)
-    for i, (ny, nx) in enumerate(problem.shapes):
-        xy = problem.xy[:, problem.part(i)][:, residuals.used[problem.part(i)]].T
-        shares[i], numbers[i] = 1 - enclosed_area(xy) / (nx * ny), len(xy)
-    # Of n points spread evenly 8/3 ln n / n lies outside the hull in the mean (Renyi & Sulanke 1963); the scatter is
-    # that of simulated points. Half of a frame is worth a word, if it is more than chance and dithers explain.
-    n = np.maximum(numbers, 3)
-    chance = np.minimum(0.95, 8 / 3 * np.log(n) / n + 5 / n**0.85)
-    limits = np.maximum(_TOO_MUCH, chance)
-    for i in np.flatnonzero(shares > limits):
-        limits[i] = max(_TOO_MUCH, 1 - (1 - chance[i]) * _within_reach(residuals, i))
-    worst = int(np.argmax(shares - limits)) if np.any(shares > limits) else int(np.argmax(shares))
-    share, limit, name = shares[worst], limits[worst], problem.names[worst]
-    words = f"up to {share:.0%} of a frame lies outside its stars, where distortions are extrapolated ({name})"
-    if share > limit:
-        return Check("extrapolation", "warn", share, limit, words,
-                     "measure fainter stars (a lower --threshold), or trust the correction only within the stars"
-                     )  # fmt: skip
-    return Check("extrapolation", "pass", share, limit, words)
-
-
-def _within_reach(residuals, i):
-    """Part of a frame that lies on as many exposures as every star must."""
-    problem, poses = residuals.problem, residuals.state.poses
-    fewest = np.bincount(problem.star, minlength=problem.n_stars).min()
-    ny, nx = problem.shapes[i]
-    step = (np.arange(64) + 0.5) / 64
-    xy = np.stack(np.meshgrid(step * nx, step * ny)).reshape(2, -1) - 0.5
-    plane = np.linalg.solve(poses[i, :, :2], xy - poses[i, :, 2:])
-    number = 0
-    for pose, (ny, nx) in zip(poses, problem.shapes, strict=True):
-        x, y = pose[:, :2] @ plane + pose[:, 2:]
-        number = number + ((x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5))
-    return np.mean(number >= fewest)
 
 
 def rejection_check(solution):
