@@ -41,8 +41,9 @@ def _declared(sigma, static_sigma):
     """The size of a static distortion of which nothing else is known, a positive number."""
     if not (sigma is None or (isinstance(sigma, str) and sigma == EVIDENCE)):
         raise InputError(
-            "sigma is the scatter of exposures around a mean: give the mean as well, or leave sigma out; without one "
-            f"it is found, {EVIDENCE!r}"
+            "sigma is the scatter of exposures around a mean: where static_sigma states but the size of the static "
+            "distortion it is found with it; leave out sigma (--prior-sigma) or static_sigma (--static-sigma), or give "
+            "the mean (--prior)"
         )
     given = isinstance(static_sigma, Real) and not isinstance(static_sigma, bool)
     if not (given and 0 < static_sigma < np.inf):

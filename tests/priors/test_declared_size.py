@@ -112,7 +112,7 @@ def test_scatter_alone_is_found_about_what_exposures_show(tmp_path):
 
 
 def test_scatter_needs_a_mean():
-    with pytest.raises(InputError, match="without one it is found, 'evidence'"):
+    with pytest.raises(InputError, match=r"found with it; leave out sigma \(--prior-sigma\) or static_sigma"):
         ld.Prior(None, sigma=0.3)
     with pytest.raises(InputError, match="sigma is the scatter of exposures around a mean"):
         ld.Prior(None, sigma=0.3, static_sigma=2.0)
