@@ -1,5 +1,7 @@
 """An exposure whose map few stars hold: it is named, with its error, and what is advised cures it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -7,6 +9,7 @@ from astropy.table import Table
 
 import legdistort as ld
 from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.solving.checks import extrapolated_maps
 from legdistort.wcs.attachment import attach
 
 SIDE, NOISE = 1024, 0.02
@@ -74,3 +77,10 @@ def test_attach_says_it_in_one_line(tmp_path, caplog):
         lines = [record.getMessage() for record in caplog.records if "hardly determined" in record.getMessage()]
         assert len(lines) == told
         assert all("e6 (error up to" in line and line.endswith("that is so in their WCSs too") for line in lines)
+
+
+@pytest.mark.parametrize(("dynamic", "whole"), [("detector", "e6"), (None, "e6-H2RG-1")])
+def test_of_single_detectors_the_whole_exposure_is_left_out(dynamic, whole):
+    rows = Table({"exposure": ["e5-2", "e6-H2RG-1"], "detector": ["2", "H2RG-1"]})
+    solution = SimpleNamespace(settings=SimpleNamespace(dynamic=dynamic), residuals=rows)
+    assert extrapolated_maps._whole(solution, "e6-H2RG-1") == whole

@@ -71,12 +71,20 @@ def _hardly_determined(solution, residuals, shares):
     names = sorted(found, key=found.get, reverse=True)
     named = some_of([f"{name} (error up to {found[name]:.2g} px)" for name in names], MOST_NAMED)
     which, without = ("maps are", "them") if len(names) > 1 else ("map is", "it")
-    leave = " ".join(names[:MOST_NAMED])
+    leave = " ".join(list(dict.fromkeys(_whole(solution, name) for name in names))[:MOST_NAMED])
     return Check("extrapolation", "warn", found[names[0]], limit,
                  f"the {which} hardly determined over a good part of the frame, where too few stars join it to the "
                  f"others: {named}",
                  f"leave {without} out (--without {leave}), add exposures that overlap it, lower the degree, or keep "
                  "to the part with stars (coadd --extrapolated mask)")  # fmt: skip
+
+
+def _whole(solution, name):
+    """Name by which an exposure is left out: without its detector, where each of these is solved by itself."""
+    if solution.settings.dynamic != "detector":
+        return name
+    rows = solution.residuals[np.asarray(solution.residuals["exposure"]).astype(str) == name]
+    return name.removesuffix(f"-{rows['detector'][0]}")
 
 
 def _measured(solution, residuals):
