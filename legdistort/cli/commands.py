@@ -157,26 +157,25 @@ def do_match(a):
 
     contract = column_contract.DETECTED | {name: column_contract.MATCHED[name] for name in ("epoch", "block")}
     read = told_apart([(Path(path), read_given(path, a, contract)) for path in a.tables])
+    camera = given_camera(a.camera) or _measured_with(read.values())
     if a.wcs is None:
         refuse({"ext": a.ext}, "is for the frames of --wcs")
         exposures = None
     else:
         exposures = open_wcs(a.wcs, ext=a.ext, shape=a.shape and tuple(a.shape))
+        exposures = camera.of_detectors(exposures) if camera else exposures  # a list has the detector of its frame
         read = {path: named_after(table, exposures, path) for path, table in read.items()}
     tables = list(read.values())
     if not any(map(len, tables)):
         column_contract.check(tables[0], contract, str(a.tables[0]))
     names = names_of_images(read)
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
-    camera = given_camera(a.camera) or _measured_with(tables)
     if camera:
         refuse({"shape": a.shape}, "comes from the camera of the run")
     known = {"shape": tuple(a.shape) if a.shape and a.wcs is None else shapes or None, "camera": camera}
-    if exposures is not None:
-        exposures = camera.of_detectors(exposures) if camera else exposures
-    elif (exposures := measured_frames(read)) is not None:
+    if exposures is None and (exposures := measured_frames(read)) is not None:
         refuse({"shape": a.shape}, "comes from the frames")
-    elif camera is None:
+    elif exposures is None and camera is None:
         warn_of_detectors(names)
     known |= {"exposures": exposures, "progress": wants_progress(a)}
     with timed({}, "match"):

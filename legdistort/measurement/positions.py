@@ -357,7 +357,8 @@ def _warn_of_gain(photons):
     names = [name for name, photon in photons.items() if photon is not None]
     if names:
         gains = [1 / photon for photon in photons.values() if photon]
-        found = f"equivalent gain {min(gains):.3g} to {max(gains):.3g} e-/ADU" if gains else "none could be seen"
+        seen = list(dict.fromkeys(f"{gain:.3g}" for gain in (min(gains), max(gains)))) if gains else []
+        found = f"equivalent gain {' to '.join(seen)} e-/ADU" if seen else "none could be seen"
         warn(
             f"no gain known for {some_of(names, 3)}: photon noise estimated from the residuals of the star fits "
             f"({found}); give gain= or the keyword GAIN to have it exact",

@@ -96,9 +96,10 @@ class Catalogue(ShownAsPrinted):
 
     def __repr__(self) -> str:
         n_images = self.stars.meta["n_images"]
+        images = f"{n_images} image{'s' * (n_images != 1)}"
         if self.stars.meta.get("forced"):
-            return f"<Catalogue: {len(self.stars)} given positions in {n_images} images>"
-        return f"<Catalogue: {len(self.stars)} stars in {n_images} images, {self.stars.meta['n_new']} of them new>"
+            return f"<Catalogue: {len(self.stars)} given positions in {images}>"
+        return f"<Catalogue: {len(self.stars)} stars in {images}, {self.stars.meta['n_new']} of them new>"
 
     @property
     def check(self) -> Check:

@@ -209,6 +209,18 @@ def test_a_visit_by_its_catalogues(ending, read, visit, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("which", ["*nrca2_", "jw01_02105_00002_nrca2_"], ids=["one detector", "one list"])
+def test_lists_of_one_detector_of_a_known_camera(which, visit, tmp_path, monkeypatch):
+    """The frame beside a list says which detector that is of, where the camera has more than these lists show."""
+    monkeypatch.chdir(tmp_path)
+    legdistort.Camera.of_frames(open_wcs(sorted(visit.glob("*_cal.fits")))).write("camera.asdf")
+    lists, files = ([str(path) for path in sorted(visit.glob(f"{which}{end}"))] for end in ("cat.ecsv", "cal.fits"))
+    words = ["--wcs", *files, "--camera", "camera.asdf", "--error", "0.01"]
+    assert main(["match", *lists, *words, "--out", "m.ecsv", "--quiet"]) == 0
+    assert set(QTable.read("m.ecsv")["detector"]) == {"NRCA2"}
+
+
+@pytest.mark.slow
 def test_catalogues_beside_bare_gwcs(visit, tmp_path, monkeypatch):
     """Files of a gwcs and nothing else: sky and shape of lists, and places to put the refined gwcs into."""
     monkeypatch.chdir(tmp_path)
