@@ -7,7 +7,7 @@ import drawn_sets
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy import sparse, stats
+from scipy import optimize, sparse, stats
 
 import legdistort as ld
 from legdistort.cameras.stated_errors import StaticSpread
@@ -96,6 +96,31 @@ class TestPosterior:
                 sizes = np.where(np.arange(2) == k, factor * best.sizes, best.sizes)
                 assert Posterior(*linear[:2], sizes).cost > best.cost
         assert np.all(best.determined < [6, 6])
+
+    def test_most_likely_sizes_beside_unknowns_of_no_size_are_those_of_the_dense_model(self):
+        rng = RNG(7)
+        design, rows = rng.normal(size=(30, 12)), np.zeros((12, 12))
+        rows[:8, 2:10] = np.eye(8)
+        rows[8:, [0, 1, 10, 11]] = np.eye(4)
+        rows[8:, 2:6] = rng.normal(size=(4, 4))  # what is given ties both kinds of unknowns
+        size, width = np.repeat([0, 1, GIVEN], 4), np.full(12, 0.7)
+        value, stretch = rng.normal(size=12) * [*[3.0] * 4, *[0.5] * 4, *[0.7] * 4], rng.uniform(1, 2, 12)
+        y = design @ np.linalg.solve(rows, rng.normal(size=12) * [*[3.0] * 4, *[0.5] * 4, *[0.7] * 4]) + rng.normal(
+            size=30
+        )
+        data = ReducedData(design.T @ design, design.T @ y, float(y @ y), 30)
+        factor = Factor("test", sparse.csr_array(rows), value, width, size, stretch)
+
+        def cost(logs):  # y ~ N(mean, I + D R^-1 W^2 R'^-1 D'), for z = R^-1 (W e - value)
+            widths = stretch * np.where(size == GIVEN, width, np.append(np.exp(logs), 0.0)[size])
+            turned = design @ np.linalg.inv(rows)
+            covariance, away = np.eye(30) + turned * widths**2 @ turned.T, y + turned @ value
+            return np.linalg.slogdet(covariance)[1] + away @ np.linalg.solve(covariance, away)
+
+        best = most_likely(data, factor, [1.0, 1.0], (1e-3, 1e3))
+        expected = optimize.minimize(cost, [0.0, 0.0], method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-9})
+        assert_allclose(np.log(best.sizes), expected.x, atol=0.02)  # slopes below 0.02 count as none
+        assert len(best.mean) == 12
 
     def test_without_a_factor_is_the_limit_of_a_wide_one(self, linear):
         data, factor, _ = linear

@@ -116,15 +116,17 @@ class Unknowns:
 
     def gather(self, gradient):
         """The transpose of `spread`: (n_exposures, 2 n_modes, ...) -> (size, ...)."""
-        n, rest = len(self.group), gradient.shape[2:]
+        rest = gradient.shape[2:]
         if not self.shared:
             return gradient.reshape(-1, *rest)
-        common = self._rows[1]
-        mine = np.einsum("ikm,im...->ik...", self._own, gradient)
-        total = np.zeros((len(common), *gradient.shape[1:]))
-        np.add.at(total, self.group, gradient)
-        theirs = np.einsum("gkm,gm...->gk...", common, total)
-        return np.concatenate([mine.reshape(n * self.n_own, *rest), theirs.reshape(-1, *rest)])
+        columns = gradient.reshape(*gradient.shape[:2], -1)
+        mine = np.matmul(self._own, columns)
+        theirs = np.matmul(self._rows[1], self._totals(columns))
+        return np.concatenate([each.reshape(-1, *rest) for each in (mine, theirs)])
+
+    def _totals(self, each):
+        """Sums over the exposures of every group, (n_exposures, ...) -> (n_groups, ...)."""
+        return np.stack([each[self.group == g].sum(axis=0) for g in range(len(self._rows[1]))])
 
     def matrix(self, blocks):
         """Exposure blocks (n_exposures, 2 n_modes, 2 n_modes) as one matrix on the vector, (size, size)."""
@@ -162,9 +164,7 @@ class Unknowns:
         if not self.shared:
             return _inverse(blocks)
         own, common = (rows[self.group] for rows in self._rows)
-        total = np.zeros((self.group.max() + 1, *blocks.shape[1:]))
-        np.add.at(total, self.group, blocks)
-        parts = (own, blocks), (common, total[self.group])
+        parts = (own, blocks), (common, self._totals(blocks)[self.group])
         return sum(r.mT @ _inverse(r @ block @ r.mT) @ r for r, block in parts)
 
     def covariance(self, matrix):

@@ -42,6 +42,11 @@ class Factor:
         """Width of every row (k,) at some sizes."""
         return self.stretch * np.where(self.size == GIVEN, self.width, np.append(sizes, np.nan)[self.size])
 
+    def part(self, keep):
+        """Some of its rows (k,) alone."""
+        each = (getattr(self, name)[keep] for name in ("rows", "value", "width", "size", "stretch"))
+        return Factor(self.name, *each)
+
     @classmethod
     def joined(cls, factors):
         """Several factors as one."""
