@@ -559,26 +559,6 @@ def test_an_odd_night_does_little_harm(words, n_sets):
     assert np.sqrt(with_it[:, 2].mean() / without[:, 2].mean()) < 1 + 0.15 * wide
 
 
-@pytest.mark.parametrize(
-    ("odd_ones", "sets"),
-    [
-        ((3, 6), [0, 6]),
-        pytest.param((3, 6), range(20), marks=pytest.mark.sets),
-        pytest.param((6, 7), range(20), marks=pytest.mark.sets),
-    ],
-)
-def test_two_odd_nights_do_little_harm(odd_ones, sets):
-    """One of them, or both, among the two that are turned, which alone tell of most common maps.
-
-    Median squares over those stated, of 20 sets: 0.7 and 1.7. Where the fit of the common maps had no part in how odd a
-    night is, so that a night hid behind the maps that it drew to itself, 1.8 and 23; errors 0.12 px in place of 0.017.
-    """
-    words = {"odd": 0.5, "odd_ones": odd_ones, "motion": 0.02}
-    figures = squares(((each, each.table) for each in (Nights(seed, **words) for seed in sets)), motion="auto")
-    assert np.median(figures[:, 0] / figures[:, 1]) < (2 if odd_ones == (6, 7) else 1.3)
-    assert odd_ones == (6, 7) or np.median(np.sqrt(figures[:, 2])) < 0.03
-
-
 # --- a night that is odd -----------------------------------------------------------------------------------------
 
 
