@@ -257,8 +257,8 @@ def find_image(hdulist, ext, label, *, of_several=False):
     where = "" if ext is None else f" in extension {ext!r}"
     if ext is not None:
         try:
-            candidates = list(_named(_numbered(hdulist), ext).values()) if is_pattern(ext) else [hdulist[ext]]
-            candidates[0]
+            matching = list(_named(_numbered(hdulist), ext).values()) if is_pattern(ext) else []
+            candidates = matching or [hdulist[ext]]
         except (KeyError, IndexError):
             present = ", ".join(f"{i} {h.name}".strip() for i, h in enumerate(hdulist))
             told = detectors_of([hdu for hdu in hdulist if is_image(hdu)])

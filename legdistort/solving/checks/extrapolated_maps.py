@@ -47,15 +47,19 @@ def _within_reach(residuals, i):
     """Part of a frame that lies on as many exposures as every star must."""
     problem, poses = residuals.problem, residuals.state.poses
     fewest = np.bincount(problem.star, minlength=problem.n_stars).min()
-    ny, nx = problem.shapes[i]
-    step = (np.arange(64) + 0.5) / 64
-    xy = np.stack(np.meshgrid(step * nx, step * ny)).reshape(2, -1) - 0.5
-    plane = np.linalg.solve(poses[i, :, :2], xy - poses[i, :, 2:])
+    plane = np.linalg.solve(poses[i, :, :2], _places(problem.shapes[i], 64) - poses[i, :, 2:])
     number = 0
     for pose, (ny, nx) in zip(poses, problem.shapes, strict=True):
         x, y = pose[:, :2] @ plane + pose[:, 2:]
         number = number + ((x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5))
     return np.mean(number >= fewest)
+
+
+def _places(shape, n):
+    """Pixels (2, n * n) spread evenly over a frame (ny, nx)."""
+    ny, nx = shape
+    step = (np.arange(n) + 0.5) / n
+    return np.stack(np.meshgrid(step * nx, step * ny)).reshape(2, -1) - 0.5
 
 
 def _hardly_determined(solution, residuals, shares):
@@ -96,8 +100,5 @@ def _measured(solution, residuals):
 def _map_errors(solution, i, shape):
     """Errors of the map of an exposure, relative to the stars, over its frame, pixels (n,), the larger axis."""
     view = solution[solution.names[i]]
-    ny, nx = shape
-    step = (np.arange(_GRID) + 0.5) / _GRID
-    q = np.stack(np.meshgrid(step * nx, step * ny), axis=-1).reshape(-1, 2) - 0.5
-    variance = np.einsum("naa->na", new_positions.relative_errors(view, q))
+    variance = np.einsum("naa->na", new_positions.relative_errors(view, _places(shape, _GRID).T))
     return np.sqrt(np.maximum(variance, 0)).max(axis=1)
