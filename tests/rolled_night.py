@@ -9,7 +9,7 @@ _NORM = np.sqrt((2 * np.arange(4) + 1) / 2)
 
 
 def bend(x, y, tensor):
-    """Displacement (n, 2) by coefficients (2, 4, 4) of plain Legendre polynomials."""
+    """Displacement (n, 2) by coefficients (2, k, k) of plain Legendre polynomials."""
     return legval2d((2 * x + 1) / SIZE - 1, (2 * y + 1) / SIZE - 1, tensor.transpose(1, 2, 0)).T
 
 
@@ -42,7 +42,8 @@ def night(
         angle = np.radians(turns[i % len(turns)])
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         q = (sky - SIZE / 2) @ turn.T + SIZE / 2 + rng.uniform(-90, 90, 2)
-        q = q + bend(*q.T, static + (slope * numbers[i] if len(numbers) else 0) + field(rng, single))
+        shared = static + (slope * numbers[i] if len(numbers) else 0)
+        q = q + bend(*q.T, shared) + bend(*q.T, field(rng, single))
         q = q + rng.normal(0, sigma, q.shape)
         for j in np.flatnonzero(np.all((q > 0) & (q < SIZE - 1), axis=1)):
             rows.append((f"e{i}", j, *q[j], sigma, sigma))

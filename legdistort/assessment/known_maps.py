@@ -287,24 +287,28 @@ def _shown(fit, number=None):
 
     With a number (n_exposures,) also of its slopes: (2 K, 2 K) and (2 K,). Sizes are found with nothing known of it,
     from exposures drawn at random where these are many; with slopes if the evidence is for these. The degrees of
-    freedom are those by which they tell the determinant of the information, in the directions that count.
+    freedom are those by which they tell the determinant of the information, in the directions that count. Terms beyond
+    the degree that exposures have in common are unknowns of a size that is found, so that nothing is known by believing
+    that there are none.
     """
     varies = number is not None and np.ptp(number) > 0
     unit = np.std(number) if varies else 1.0
     away = (number - np.mean(number)) / unit if varies else None
     problem, state = fit.weighted, absorb_similarities(fit.weighted, fit.result.state)
+    top = 2 * problem.degree - 1 if problem.degree > 1 else None  # a common map of the plane bends as far
 
     def known(most):
         keep = drawn(problem.detectors, most // (2 * problem.n_modes))
         part = part_of(problem, state, keep)
-        model = ExposureModel.of(*part, fit.result.gauge.all_motion[keep], np.zeros(len(keep), dtype=int))
+        model = ExposureModel.of(*part, fit.result.gauge.all_motion[keep], np.zeros(len(keep), dtype=int), top=top)
         return replace(model, number=away[keep]) if varies else model
 
     model = known(_MOST)
     found, n_sizes = _sizes_of(model), model.n_scatters
     model = known(DIRECT_LIMIT)
+    closure = [model.closure(size=n_sizes)] if top else []
     k, free = len(model.degrees), Factor.joined([model.statics(width=FREE), model.slopes(width=FREE)])
-    whole = Posterior(model.data, Factor.joined([model.departures, free]), found.sizes[:n_sizes])
+    whole = Posterior(model.data, Factor.joined([model.departures, *closure, free]), found.sizes[: n_sizes + bool(top)])
     information, pull = whole.without(free)
     sizes, vectors = np.linalg.eigh(information[:k, :k])
     directions = vectors[:, sizes > DETERMINED].T
@@ -313,7 +317,7 @@ def _shown(fit, number=None):
         information = posterior.without(free)[0][:k, :k]
         return np.linalg.slogdet(directions @ information @ directions.T)[1] / max(len(directions), 1)
 
-    larger = whole.sizes * (1 + (_LARGER - 1) * np.eye(n_sizes))
+    larger = whole.sizes * (1 + (_LARGER - 1) * np.eye(n_sizes, len(whole.sizes)))
     share = certain(whole) - np.array([certain(replace(whole, sizes=each)) for each in larger])
     share /= 2 * np.log(_LARGER)
     dof = float(1 / np.sum(share**2 / np.maximum(_freedom(found)[:n_sizes], 1) + 1e-12))
@@ -321,16 +325,18 @@ def _shown(fit, number=None):
         information, pull = np.pad(information, (0, 2 * k - len(pull))), np.pad(pull, (0, 2 * k - len(pull)))
         per = np.repeat([1.0, unit], k)
         information, pull = per[:, None] * information * per, per * pull
-    return information, pull, whole.sizes, dof
+    return information, pull, whole.sizes[:n_sizes], dof
 
 
 def _sizes_of(model):
     """The posterior at the scatters that are most likely, with slopes of a size that is found if evidence is for it."""
     unit, found = 1 / np.sqrt(np.median(np.diag(model.data.curvature))), None
     for each in (replace(model, number=None), model)[: 1 + (model.n_slopes > 0)]:
-        sloped = each.slopes(size=each.n_scatters)
-        factor = Factor.joined([each.departures, each.statics(width=FREE), sloped])
-        start = np.full(each.n_scatters + (each.n_slopes > 0), 10 * unit)
+        n_sizes = each.n_scatters + (model.n_higher > 0)
+        closure = [each.closure(size=each.n_scatters)] if model.n_higher else []
+        sloped = each.slopes(size=n_sizes)
+        factor = Factor.joined([each.departures, *closure, each.statics(width=FREE), sloped])
+        start = np.full(n_sizes + (each.n_slopes > 0), 10 * unit)
         likely = most_likely(each.data, factor, start, unit * np.array(RANGE))
         if found is None or found.cost - likely.cost > KEPT:
             found = likely

@@ -33,7 +33,7 @@ from ..runtime.trees.facts import SIZE, array, keyed
 from . import places as found_places
 from . import static_correction, storage
 from .detector import Detector, Place
-from .from_wcs import camera_of, fullest, header_map, moved_plane, stated_detectors
+from .from_wcs import camera_of, fullest, grid_of, header_map, moved_plane, stated_detectors
 from .header_layout import HeaderLayout, compare_headers
 from .source import check_shape
 
@@ -90,8 +90,9 @@ class Camera(ShownAsPrinted):
         plane, pixels, known to `common_sigma`. It is the static distortion of the focal plane from which further
         exposures depart. None: no reference has told it.
     header_map : array_like, shape (2, 3), optional
-        Similarity from the plane of the `header_layout` of the detectors to the focal plane: with a `common_map` as the
-        sky was found, which carries scale and rotation to headers of further exposures, else as the layouts have it.
+        Similarity from the plane of the `header_layout` of the detectors to the focal plane: as the layouts have it,
+        but with a `common_map` scale and rotation are as the sky was found, which carries these to headers of further
+        exposures. Their pointing stays.
     place_errors : array_like, shape (n_detectors, 3), optional
         Standard deviations of x, y [pix] and rotation [deg] of the `places` with the `common_map`, after one affine map
         of all detectors, with what layouts and map have in common; infinite where nothing is known. None: the errors of
@@ -500,6 +501,23 @@ class Camera(ShownAsPrinted):
             return camera
         known = self._carried(stated) if self.states_scale else header_map(camera, stated)
         return replace(camera, header_map=known)
+
+    def with_header_map(self, found: np.ndarray) -> Camera:
+        """The camera with scale and rotation of a `header_map` found on the sky (2, 3), the shift as layouts have it.
+
+        That by which a sky is away from headers is the pointing of these, which is another one in the next visit.
+        """
+        odd = () if self.headers is None else self.headers.odd
+        lie = [each for key, each in self.detectors.items() if each.header_layout is not None and key not in odd]
+        pixels = [grid_of(each.shape) for each in lie]
+        here, there = (
+            np.mean(
+                [similarity.apply(similarity.invert(pose), xy) for pose, xy in zip(poses, pixels, strict=True)], (0, 1)
+            )
+            for poses in ([each.layout for each in lie], [each.header_layout for each in lie])
+        )
+        turn = np.asarray(found)[:, :2]
+        return replace(self, header_map=np.column_stack([turn, here - turn @ there]))
 
     def _carried(self, stated):
         """The `header_map` for headers that have detectors otherwise turned or shifted as a whole; None for others.

@@ -297,7 +297,7 @@ def _with_camera(solution, given):
     camera = with_common_map(solution.camera, solution)
     if camera.has_focal_plane and solution.gauge.n_fields == 1:
         found = header_map_by(given, solution.poses, solution.sky)
-        camera = camera if found is None else replace(camera, header_map=found)
+        camera = camera if found is None else camera.with_header_map(found)
     return replace(solution, camera=camera)
 
 

@@ -14,6 +14,7 @@ import legdistort as ld
 from legdistort.assessment.combined_nights import Chain, fitted
 from legdistort.cli import main
 from legdistort.exceptions import AssumptionWarning, InputError
+from legdistort.geometry import detector_modes
 
 SHAPE = (SIZE, SIZE)
 ORDERS = np.add.outer(np.arange(4), np.arange(4))
@@ -217,6 +218,40 @@ def test_what_a_night_was_solved_with_does_not_count(three):
     assert "One night does not tell how far nights scatter" in str(free)
 
 
+def bent_farther(seed, size):
+    """A static distortion with plain Legendre terms of degrees 4 and 5 of a size [px], which no cubic has."""
+    tensor = np.pad(static(seed), ((0, 0), (0, 2), (0, 2)))
+    degree = np.add.outer(np.arange(6), np.arange(6))
+    beyond = np.random.default_rng(40 + seed).normal(0, size, tensor.shape)
+    return tensor + np.where((degree > 3) & (degree < 6), beyond, 0)
+
+
+def misfit(seed, combined):
+    """Mean squared error of a cubic static distortion in its stated errors, in all directions that are determined."""
+    found, covariance = combined.static()
+    rows = detector_modes.dynamic_basis(SHAPE, 10)
+    off, sizes = rows @ (found - modes(static(seed))).ravel(), rows @ covariance @ rows.T
+    variance, vectors = np.linalg.eigh(sizes)
+    known = variance < 0.1**2
+    assert known.sum() > 10
+    return np.mean((off @ vectors[:, known]) ** 2 / variance[known])
+
+
+@pytest.mark.parametrize("n", [1, pytest.param(20, marks=pytest.mark.slow)])
+def test_nights_do_not_believe_that_a_cubic_is_exact(n):
+    """With such terms of 0.01 px rolls and dithers would tell what they do not, if polynomials were believed exact.
+
+    Mean squares are 1.6 and 5 then, of one night and of twenty, whose beliefs add up.
+    """
+    squares = []
+    for seed in (1, 3):
+        static = bent_farther(seed, 0.01)
+        nights = [night(6000 + 50 * seed + i, static, turns=(0, 30, -30), sigma=0.01) for i in range(n)]
+        solved = [ld.solve(ld.Matches.from_table(each, shape=SHAPE)) for each in nights]
+        squares.append(misfit(seed, ld.combine_nights(solved)))
+    assert 0.4 < np.mean(squares) < 1.25
+
+
 @pytest.mark.slow
 def test_nights_one_after_the_other_or_in_any_order_are_the_same(three):
     all_at_once = ld.combine_nights(three)
@@ -397,7 +432,7 @@ def test_the_scatter_of_exposures_is_found_and_stated_for_one_alone(tmp_path):
     drawn = np.array([modes(field(np.random.default_rng(seed), 0.05)) for seed in range(500)])
     combined = ld.combine_nights(campaign(3, 3, single=0.05, exposures=9))
     of_degree = [np.sqrt(np.mean(drawn[:, :, each] ** 2)) for each in (slice(3, 6), slice(6, 10))]
-    assert_allclose(combined.exposure_scatter[1:], of_degree, rtol=0.25)
+    assert_allclose(combined.exposure_scatter[1:], of_degree, rtol=0.3)  # chance of a size: an eighth
     assert "Exposures scatter about their night by " in str(combined)
     usual, alone = combined.prior(), combined.prior(one_exposure=True)
     assert usual.sigma is None

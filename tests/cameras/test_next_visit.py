@@ -97,6 +97,21 @@ def off_sky(night, solution):
     return abs(factor) - 1, np.degrees(np.angle(factor)), np.sqrt(np.mean(left**2))
 
 
+def pointing_off(night, solution):
+    """How far the stars lie from the truth on the sky, in mean, east and north: pixels."""
+    true = on_sky(night.sky[night.true_stars(solution)])
+    found = np.column_stack([solution.stars["ra"].value, solution.stars["dec"].value])
+    return np.mean((found - true) * [np.cos(np.radians(-20.0)), 1], axis=0) * 3600 / header_layouts.ARCSEC
+
+
+def test_the_pointing_of_the_next_visit_is_that_of_its_headers(night, first):
+    """What a reference corrected of the first visit's, whose headers are off by 5 px more, is no part of the camera."""
+    assert np.abs(pointing_off(night, first)).max() < 0.02
+    alone, second = (ld.solve(matched(night, 1, each), prior=EVIDENCE) for each in (None, first.camera))
+    assert np.abs(pointing_off(night, alone)).max() > 0.3
+    assert pointing_off(night, second) == pytest.approx(pointing_off(night, alone), abs=0.1)
+
+
 def test_the_next_visit_has_the_scale_and_the_rotation_of_the_first(night, first, tmp_path):
     """Through a file; its roll is wrong by what the headers have otherwise than in the first one."""
     assert off_sky(night, first)[0] == pytest.approx(0, abs=1e-5)
