@@ -96,9 +96,8 @@ def make_others(folder, solution, matches):
     grid = WCS(naxis=2)
     grid.wcs.ctype, grid.wcs.crval, grid.wcs.crpix = ("RA---TAN", "DEC--TAN"), (10.0, -70.0), (20.0, 15.0)
     grid.wcs.cdelt, grid.array_shape = (-1e-5, 1e-5), (30, 40)
-    legdistort.coadd(frames, solution, grid=grid, weights=None, scale=None, match_background=False).write(
-        folder / "mosaic.fits", overwrite=True
-    )
+    settings = {"weights": None, "scale": None, "match_background": False, "planes": "all"}
+    legdistort.coadd(frames, solution, grid=grid, **settings).write(folder / "mosaic.fits", overwrite=True)
     return seen_camera(camera) | seen_matches(folder / "matched.ecsv") | seen_mosaic(folder / "mosaic.fits")
 
 

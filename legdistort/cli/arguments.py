@@ -5,6 +5,8 @@ import os
 import sys
 from pathlib import Path
 
+from ..runtime.words import ALL_PLANES
+
 #: Images of which each has a line.
 _MOST_LINES = 10
 
@@ -30,8 +32,9 @@ def columns(text):
 
 
 def planes(text):
-    """Names of planes of a mosaic, ``UNCERT,WEIGHT``, in any case; none of them for ``none``."""
-    return () if text == "none" else tuple(text.upper().split(","))
+    """Names of planes of a mosaic, ``UNCERT,WEIGHT``, or ``all``, in any case; none of them for ``none``."""
+    words = () if text.lower() == "none" else text.split(",")
+    return tuple(ALL_PLANES if word.lower() == ALL_PLANES else word.upper() for word in words)
 
 
 def some_words(choices):

@@ -341,7 +341,9 @@ COADDING = Group(
         "scale": Option("of fluxes (default auto)", choices=(*words.SCALES, "none"), none="none"),
         "extrapolated": Option("pixels outside the stars used (default flag)", choices=words.EXTRAPOLATED),
         "planes": Option(
-            "beside the image in the file (default all); none: nothing", type=planes, metavar="UNCERT,..."
+            f"beside the image in the file, or all, or none (default {','.join(words.USUAL_PLANES)})",
+            type=planes,
+            metavar="UNCERT,...",
         ),
         "scratch": SCRATCH,
     },

@@ -23,7 +23,7 @@ from ..runtime.fits_bytes import BLOCK, sum32, with_checksum
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.outputs import replacing
 from ..runtime.scratch import forget
-from ..runtime.words import PLANES
+from ..runtime.words import PLANES, USUAL_PLANES
 from .combination import PixelFlag
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 _ENDING = re.compile(r"\.(?:(?P<asdf>asdf)|(?:fits|fit|fts)(?P<packed>\.gz|\.bz2)?)$", re.IGNORECASE)
 _PACKERS = {".gz": gzip.open, ".bz2": bz2.open}
-_ROWS = 256  # that are written at a time
+_ROWS = 256  # that are written at a time: a multiple of 4, for the checksums
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -109,7 +109,7 @@ class Mosaic(ShownAsPrinted):
     header: fits.Header = field(default_factory=fits.Header)
     extrapolated: np.ndarray | None = None
     rejected: np.ndarray | None = None
-    planes: tuple[str, ...] = tuple(PLANES)
+    planes: tuple[str, ...] = USUAL_PLANES
 
     @property
     def mask(self) -> np.ndarray:
@@ -189,13 +189,20 @@ class Mosaic(ShownAsPrinted):
         return tuple(name for i, name in enumerate(self.exposures) if planes[i // 32] >> np.uint32(i % 32) & 1)
 
     def to_hdulist(self) -> HDUList:
-        """The FITS file: image (primary HDU, ``SCI``), ``UNCERT``, ``MASK``, ``WEIGHT``, ``FOOTPRINT`` and the others.
+        """The FITS file: image (primary HDU, ``SCI``), ``UNCERT``, ``MASK``, ``FOOTPRINT``, or what `planes` names.
 
-        These are ``FLAGS``, ``EXTRAPOLATED``, ``REJECTED`` and ``CONTEXT``, as far as `planes` names them.
-        ``CCDData.read`` finds the variances (``UTYPE`` of ``UNCERT``) and the mask. Each has the WCS. ``CONTEXT`` has
-        a third axis where there are more than 32 exposures; a bit counts them in the order of the keywords
-        ``IMCMB001``, ``IMCMB002``, ...
+        There are ``WEIGHT``, ``FLAGS``, ``EXTRAPOLATED``, ``REJECTED`` and ``CONTEXT`` besides. Each has the WCS.
+        ``UNCERT`` is the standard deviation, the root of `variance`, here a new array in memory. ``CCDData.read`` finds
+        it and the mask. ``CONTEXT`` has a third axis where there are more than 32 exposures; a bit counts them in the
+        order of the keywords ``IMCMB001``, ``IMCMB002``, ...
         """
+        hdulist = self._hdulist()
+        if "UNCERT" in hdulist:
+            hdulist["UNCERT"].data = np.sqrt(self.variance)
+        return hdulist
+
+    def _hdulist(self):
+        """That of `to_hdulist`, but with the variance in the place of its root, which is taken as it is written."""
         header = self.header.copy()
         cards = self.wcs.to_header(relax=True)
         for key in [key for key in cards if key.startswith(("DATE-", "MJD-"))]:  # of the file that gave the grid
@@ -224,11 +231,8 @@ class Mosaic(ShownAsPrinted):
             hdu = (fits.ImageHDU if hdulist else fits.PrimaryHDU)(plane, header)
             hdu.name = name
             hdulist.append(hdu)
-        unit = header.get("BUNIT")
         if "UNCERT" in hdulist:
-            if unit:
-                hdulist["UNCERT"].header["BUNIT"] = f"({unit})**2"
-            hdulist["UNCERT"].header["UTYPE"] = ("VarianceUncertainty", "class of astropy.nddata")
+            hdulist["UNCERT"].header["UTYPE"] = ("StdDevUncertainty", "class of astropy.nddata")
         for name, meaning in (
             ("MASK", "1: no value, or saturated"),
             ("WEIGHT", "sum of weights"),
@@ -273,8 +277,8 @@ class Mosaic(ShownAsPrinted):
         return Path(path)
 
     def _append_to(self, file):
-        for hdu in self.to_hdulist():
-            _append(file, hdu)
+        for hdu in self._hdulist():
+            _append(file, hdu, np.sqrt if hdu.name == "UNCERT" else None)
 
     def _tree(self):
         dropped = {"planes"} | {PLANES[name] for name in PLANES if name not in self.planes}
@@ -305,24 +309,26 @@ def check_ending(path):
     return ending
 
 
-def _append(file, hdu):
+def _append(file, hdu, function):
     """Add an HDU with its checksums to a FITS file, a few rows at a time: astropy would turn all of it in memory.
 
-    ``StreamingHDU``, which would not, closes the file after each.
+    Its data are what a function makes of those of `hdu`, unless it is None. ``StreamingHDU``, which takes rows too,
+    closes the file after each.
     """
     header, size, datasum = hdu.header.copy(), 0, 0
-    for content in _pieces(hdu.data):
+    for content in _pieces(hdu.data, function):
         size, datasum = size + len(content), sum32(content + bytes(-len(content) % 4), datasum)
     header["CHECKSUM"], header["DATASUM"] = ("0" * 16, "of the HDU"), (str(datasum), "of its data")
     file.write(with_checksum(header.tostring().encode("ascii"), datasum))
-    for content in _pieces(hdu.data):
+    for content in _pieces(hdu.data, function):
         file.write(content)
     file.write(bytes(-size % BLOCK))
 
 
-def _pieces(plane):
+def _pieces(plane, function):
     """The bytes of a plane as FITS has them, a few rows at a time; but for the last of them whole words of 32 bits."""
     rows = plane.reshape(-1, plane.shape[-1])
     for start in range(0, len(rows), _ROWS):
-        yield rows[start : start + _ROWS].astype(rows.dtype.newbyteorder(">")).tobytes()
+        part = rows[start : start + _ROWS]
+        yield (part if function is None else function(part)).astype(rows.dtype.newbyteorder(">")).tobytes()
         forget(rows)

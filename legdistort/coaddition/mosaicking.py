@@ -18,7 +18,6 @@ from ..results.solution import Solution
 from ..runtime.guards.units import plain_numbers
 from ..runtime.parallel import map_items
 from ..runtime.scratch import scratch_folder
-from ..runtime.words import PLANES
 from .background import match_backgrounds
 from .block_stack import Layer, Recipe, assemble, n_bytes
 from .flux_scales import flux_scales
@@ -61,7 +60,7 @@ def coadd(
     kernel: str = "square",
     workers: int | None = None,
     scratch: StrPath | None = None,
-    planes: Sequence[str] | None = None,
+    planes: str | Sequence[str] | None = None,
     progress: bool = False,
 ) -> Mosaic:
     """Co-add exposures on the distortion-free reference plane, or on any celestial WCS.
@@ -112,9 +111,10 @@ def coadd(
         Folder for the pixels of the exposures while work goes on, 4 to 11 bytes for each (17 in double precision), and
         for those of the mosaic, 21 or more, as long as it is in use; the workers of a cluster must see it. The default
         is that of the system (``TMPDIR``), which some systems keep in memory.
-    planes : sequence of str, optional
+    planes : str or sequence of str, optional
         What `Mosaic.write` puts beside the image: of ``"UNCERT"``, ``"MASK"``, ``"WEIGHT"``, ``"FOOTPRINT"``,
-        ``"FLAGS"``, ``"EXTRAPOLATED"``, ``"REJECTED"``, ``"CONTEXT"``; an empty one for nothing. None = all.
+        ``"FLAGS"``, ``"EXTRAPOLATED"``, ``"REJECTED"``, ``"CONTEXT"``, or ``"all"`` of them; an empty sequence for
+        nothing. None = errors, mask and number of exposures (``UNCERT``, ``MASK``, ``FOOTPRINT``).
     progress : bool
         Show progress bars.
 
@@ -203,8 +203,8 @@ def _coadd(exposures, solution, options, share):
     names = tuple(f.name for f in frames)
     *planes, extrapolated, rejected = planes
     made = {"exposures": names, "left_out": left_out, "offset": output.offset, "header": header}
-    made["planes"] = tuple(PLANES) if options.planes is None else options.planes
-    return Mosaic(*planes, wcs=output.wcs, **made, extrapolated=extrapolated, rejected=rejected)
+    shares = {"extrapolated": extrapolated, "rejected": rejected}
+    return Mosaic(*planes, wcs=output.wcs, **made, **shares, planes=options.planes)
 
 
 def _working_unit(solution):

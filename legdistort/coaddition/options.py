@@ -10,7 +10,19 @@ from astropy.wcs import WCS
 from ..exceptions import InputError
 from ..runtime.checks import check_choice
 from ..runtime.scratch import scratch_folder
-from ..runtime.words import ALGORITHMS, COMBINATIONS, CONSERVE, EXTRAPOLATED, KERNELS, ORDERS, PLANES, SCALES, WEIGHTS
+from ..runtime.words import (
+    ALGORITHMS,
+    ALL_PLANES,
+    COMBINATIONS,
+    CONSERVE,
+    EXTRAPOLATED,
+    KERNELS,
+    ORDERS,
+    PLANES,
+    SCALES,
+    USUAL_PLANES,
+    WEIGHTS,
+)
 from .grids import checked_wcs
 from .resampling.engines import Resampling, uses_compiled_splines
 
@@ -28,8 +40,8 @@ class CoaddOptions:
     grid : `~astropy.wcs.WCS`, `~astropy.io.fits.Header` or None
     weights, scale : str, None or dict
         A dict by exposure has positive numbers; whether it has the right names is seen with the exposures.
-    planes : tuple of str or None
-        Keys of `legdistort.runtime.words.PLANES`.
+    planes : tuple of str
+        Keys of `legdistort.runtime.words.PLANES`; None becomes the usual ones, "all" becomes all.
 
     Raises
     ------
@@ -49,7 +61,7 @@ class CoaddOptions:
     pixfrac: float = 1.0
     kernel: str = "square"
     scratch: object = None
-    planes: tuple | None = None
+    planes: tuple | str | None = None
 
     def __post_init__(self):
         choices = {"method": COMBINATIONS, "algorithm": ALGORITHMS, "conserve": CONSERVE, "extrapolated": EXTRAPOLATED}
@@ -61,11 +73,7 @@ class CoaddOptions:
         object.__setattr__(self, "order", int(order))
         for name, allowed in (("weights", WEIGHTS), ("scale", SCALES)):
             object.__setattr__(self, name, _choice_or_numbers(name, getattr(self, name), allowed))
-        if self.planes is not None:
-            planes = tuple(self.planes) if isinstance(self.planes, (list, tuple, set)) else (self.planes,)
-            for plane in planes:
-                check_choice(plane, tuple(PLANES), "planes")
-            object.__setattr__(self, "planes", planes)
+        object.__setattr__(self, "planes", _named_planes(self.planes))
         if self.grid is not None:
             checked_wcs(self.grid)
         if self.scratch is not None:
@@ -95,6 +103,16 @@ class CoaddOptions:
             unknown = [str(name) for name in given if name not in names] if isinstance(given, Mapping) else []
             if unknown:
                 raise InputError(f"{argument}: no exposure of that name is co-added: {', '.join(unknown)}")
+
+
+def _named_planes(given):
+    """The names of the planes that are asked for, as a tuple; `InputError` for those that there are not."""
+    if given is None:
+        return USUAL_PLANES
+    planes = tuple(given) if isinstance(given, (list, tuple, set)) else (given,)
+    for plane in planes:
+        check_choice(plane, (*PLANES, ALL_PLANES), "planes")
+    return tuple(PLANES) if ALL_PLANES in planes else planes
 
 
 def _choice_or_numbers(argument, given, allowed):

@@ -54,4 +54,6 @@ PLANES = {
     "UNCERT": "variance", "MASK": "mask", "WEIGHT": "weight", "FOOTPRINT": "footprint", "FLAGS": "flags",
     "EXTRAPOLATED": "extrapolated", "REJECTED": "rejected", "CONTEXT": "context",
 }  # fmt: skip
+#: Those that it has if nothing is said, and the word for all.
+USUAL_PLANES, ALL_PLANES = ("UNCERT", "MASK", "FOOTPRINT"), "all"
 EXTRAPOLATED = ("flag", "mask", "keep")

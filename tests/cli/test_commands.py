@@ -25,7 +25,7 @@ from astropy.wcs import WCS
 import legdistort
 from legdistort import Prior, Solution, calibrate_noise, coadd, match, measure, open_exposures, pipeline, predict, solve
 from legdistort.cli import commands, options, parser
-from legdistort.cli.arguments import given
+from legdistort.cli.arguments import given, planes
 from legdistort.cli.parser import main
 from legdistort.cli.running import in_shell_words
 from legdistort.cli.usage import COMMANDS
@@ -147,17 +147,7 @@ def test_files_agree_with_the_solution(demo):
     sky = solution[name].wcs(100.0, 200.0)
     assert (ra, dec) == pytest.approx(sky, abs=1e-12)
     with fits.open(demo / "mosaic.fits") as hdulist:
-        assert [hdu.name for hdu in hdulist] == [
-            "SCI",
-            "UNCERT",
-            "MASK",
-            "WEIGHT",
-            "FOOTPRINT",
-            "FLAGS",
-            "EXTRAPOLATED",
-            "REJECTED",
-            "CONTEXT",
-        ]
+        assert [hdu.name for hdu in hdulist] == ["SCI", "UNCERT", "MASK", "FOOTPRINT"]
 
 
 def test_json_is_alone_on_stdout(whole):
@@ -571,6 +561,14 @@ def _grid(demo):
     return fits.Header({"NAXIS": 2, "NAXIS1": 240, "NAXIS2": 200}) + new.to_header()
 
 
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [("uncert,Weight", ("UNCERT", "WEIGHT")), ("All", ("all",)), ("None", ()), ("all,foo", ("all", "FOO"))],
+)
+def test_names_of_planes_may_be_in_any_case(text, names):
+    assert planes(text) == names
+
+
 def test_coadd_on_the_grid_of_a_file(demo, tmp_path, capsys):
     header = _grid(demo)
     header.totextfile(tmp_path / "sky.head")
@@ -580,12 +578,13 @@ def test_coadd_on_the_grid_of_a_file(demo, tmp_path, capsys):
     wanted = coadd(exposures, solution, grid=header, **settings)
     (tmp_path / "scratch").mkdir()
     options = ["--grid", tmp_path / "sky.head", "--scratch", tmp_path / "scratch", "--conserve", "surface_brightness",
-               "--no-match-background", "--order", "bilinear", "--combine", "median"]  # fmt: skip
+               "--no-match-background", "--order", "bilinear", "--combine", "median", "--planes", "all"]  # fmt: skip
     assert main(_coadd(demo, tmp_path / "m.fits", *options)) == 0
     assert "240 x 200 px, 6 exposures" in capsys.readouterr().out
     assert list((tmp_path / "scratch").iterdir()) == []
     with fits.open(tmp_path / "m.fits") as hdulist:
-        planes = {0: "data", "UNCERT": "variance", "WEIGHT": "weight", "FOOTPRINT": "footprint", "FLAGS": "flags"}
+        np.testing.assert_array_equal(hdulist["UNCERT"].data, np.sqrt(wanted.variance))
+        planes = {0: "data", "WEIGHT": "weight", "FOOTPRINT": "footprint", "FLAGS": "flags"}
         for hdu, plane in planes.items():
             np.testing.assert_array_equal(hdulist[hdu].data, getattr(wanted, plane))
         corners = [[0, 0], [239, 0], [0, 199], [239, 199]]

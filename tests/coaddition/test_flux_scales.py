@@ -389,7 +389,7 @@ class TestFlux:
 
 def test_header_says_how(tmp_path):
     solution, *_, exposures, _ = plain()
-    mosaic = coadd(exposures, solution, weights=None, order=1)
+    mosaic = coadd(exposures, solution, weights=None, order=1, planes="all")
     header = mosaic.to_hdulist()[0].header
     assert (header["WEIGHTS"], header["SCALEBY"], header["EXTRAPOL"]) == ("equal", "exptime", "flag")
     assert header["NOISECOR"] == pytest.approx(1.5, rel=0.02)  # pixels are not of one size

@@ -11,7 +11,7 @@ import pytest
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
-from astropy.nddata import CCDData, VarianceUncertainty
+from astropy.nddata import CCDData, StdDevUncertainty, VarianceUncertainty
 from astropy.time import Time
 from astropy.utils.exceptions import AstropyUserWarning
 from astropy.wcs import WCS
@@ -386,24 +386,19 @@ class TestFile:
         mosaic.write(tmp_path / "m.fits")
         assert [p.name for p in tmp_path.iterdir()] == ["m.fits"]
         with fits.open(tmp_path / "m.fits") as hdulist:
-            assert [h.name for h in hdulist] == [
-                "SCI",
-                "UNCERT",
-                "MASK",
-                "WEIGHT",
-                "FOOTPRINT",
-                "FLAGS",
-                "EXTRAPOLATED",
-                "REJECTED",
-                "CONTEXT",
-            ]
+            assert [h.name for h in hdulist] == ["SCI", "UNCERT", "MASK", "FOOTPRINT"]
             header = hdulist[0].header
+            assert [h.header["BUNIT"] for h in hdulist] == ["adu", "adu", "", ""]
+            # Source Extractor 2.25 and its kin, without CFITSIO, open no file that has a table of compressed tiles.
+            assert not any(isinstance(h, fits.CompImageHDU) for h in hdulist)
             assert header["BUNIT"] == "adu"
             assert header["NCOMBINE"] == 4
             assert (-header["LTV1"], -header["LTV2"]) == mosaic.offset
             for hdu in hdulist:
                 sky = WCS(hdu.header).pixel_to_world(*(stars - mosaic.offset).T)
                 assert solution.sky.to_sky(stars).separation(sky).max() < 1e-9 * u.deg
+            np.testing.assert_array_equal(hdulist["UNCERT"].data, np.sqrt(mosaic.variance))
+            np.testing.assert_array_equal(hdulist["MASK"].data, np.isnan(mosaic.data))
             np.testing.assert_array_equal(hdulist["FOOTPRINT"].data, mosaic.footprint)
         (back,) = read_exposures(tmp_path / "m.fits")
         np.testing.assert_array_equal(back.data, mosaic.data)
@@ -414,7 +409,8 @@ class TestFile:
         "planes",
         [
             pytest.param((), marks=pytest.mark.slow),
-            ("UNCERT", "MASK"),
+            "all",
+            pytest.param(("UNCERT", "MASK"), marks=pytest.mark.slow),
             pytest.param(["CONTEXT"], marks=pytest.mark.sets),
             pytest.param("WEIGHT", marks=pytest.mark.sets),
         ],
@@ -422,14 +418,15 @@ class TestFile:
     def test_planes_that_are_asked_for(self, planes, tmp_path):
         solution, _, _, exposures, _ = plain()
         mosaic = coadd(exposures, solution, planes=planes)
-        whole = coadd(exposures, solution)
-        wanted = {planes} if isinstance(planes, str) else set(planes)
+        whole = replace(mosaic, planes=tuple(PLANES))
+        wanted = set(PLANES) if planes == "all" else {planes} if isinstance(planes, str) else set(planes)
         mosaic.write(tmp_path / "m.fits")
         with fits.open(tmp_path / "m.fits", checksum=True) as hdulist:
             assert {hdu.name for hdu in hdulist} == {"SCI"} | wanted
             expected = whole.to_hdulist()
             for hdu in hdulist:
                 np.testing.assert_array_equal(hdu.data, expected[hdu.name].data)
+                assert hdu.data.dtype.newbyteorder("=") == expected[hdu.name].data.dtype
         mosaic.write(tmp_path / "m.asdf")
         with asdf.open(tmp_path / "m.asdf") as file:
             others = {"data", "wcs", "exposures", "left_out", "offset", "header"}
@@ -441,8 +438,10 @@ class TestFile:
         with pytest.raises(InputError, match="planes must be one of 'UNCERT', 'MASK'"):
             coadd(exposures, solution, planes=planes)
 
-    def test_the_file_is_that_of_the_hdulist(self, tmp_path):
+    def test_the_file_is_that_of_the_hdulist(self, tmp_path, monkeypatch):
         *_, mosaic = plain()
+        monkeypatch.setattr("legdistort.coaddition.mosaic._ROWS", 100)
+        mosaic = replace(mosaic, planes=tuple(PLANES))
         mosaic.to_hdulist().writeto(tmp_path / "whole.fits", checksum=True)
         for name in ("rows.fits", "packed.fits.gz"):
             mosaic.write(tmp_path / name)
@@ -452,44 +451,56 @@ class TestFile:
             assert len(whole) == len(mine)  # a checksum that is not true would be warned of
             assert not fits.FITSDiff(whole, mine, ignore_keywords=["CHECKSUM"], ignore_comments=["DATASUM"]).diff_hdus
 
-    def test_wrong_checksums_are_noticed(self, tmp_path):
+    @pytest.mark.parametrize("name", ["UNCERT", "MASK"])
+    def test_wrong_checksums_are_noticed(self, tmp_path, name):
         plain()[-1].write(tmp_path / "m.fits")
+        with fits.open(tmp_path / "m.fits") as hdulist:
+            place = hdulist[name].fileinfo()["datLoc"]
         raw = bytearray((tmp_path / "m.fits").read_bytes())
-        raw[-2880 * 3] ^= 1
+        raw[place + 3] ^= 1
         (tmp_path / "m.fits").write_bytes(raw)
         with pytest.warns(AstropyUserWarning, match=r"(Data|Check)sum verification failed for HDU"):
             fits.open(tmp_path / "m.fits", checksum=True).close()
 
-    def test_ccddata_finds_unit_variance_mask_and_wcs(self, tmp_path):
+    def test_ccddata_finds_unit_errors_mask_and_wcs(self, tmp_path):
         solution, stars, _, exposures, _ = plain()
-        mosaic = coadd(exposures, solution)
+        mosaic = coadd([replace(e, uncertainty=np.full(SHAPE, 2.0)) for e in exposures], solution)
         mosaic.write(tmp_path / "m.fits")
         direct = mosaic.to_ccddata()
         assert np.shares_memory(direct.data, mosaic.data)
-        for ccd in (CCDData.read(tmp_path / "m.fits"), direct):
+        file = CCDData.read(tmp_path / "m.fits", hdu_mask="MASK", hdu_uncertainty="UNCERT")
+        assert (type(file.uncertainty), type(direct.uncertainty)) == (StdDevUncertainty, VarianceUncertainty)
+        assert file.uncertainty.unit == u.adu
+        np.testing.assert_array_equal(file.uncertainty.array, np.sqrt(mosaic.variance))
+        np.testing.assert_array_equal(direct.uncertainty.array, mosaic.variance)
+        for ccd in (CCDData.read(tmp_path / "m.fits"), file, direct):
             assert ccd.unit == u.adu
             np.testing.assert_array_equal(ccd.data, mosaic.data)
-            assert type(ccd.uncertainty) is VarianceUncertainty
-            np.testing.assert_array_equal(ccd.uncertainty.array, mosaic.variance)
             np.testing.assert_array_equal(ccd.mask, np.isnan(mosaic.data))
             assert ccd.mask.dtype == bool
             sky = ccd.wcs.pixel_to_world(*(stars - mosaic.offset).T)
             assert solution.sky.to_sky(stars).separation(sky).max() < 1e-9 * u.deg
             assert ccd.header["NCOMBINE"] == 4
 
-    def test_files_of_earlier_versions_are_read(self, tmp_path):
-        """They had VAR and no mask."""
+    @pytest.mark.parametrize("name", ["VAR", "UNCERT"])
+    def test_files_of_earlier_versions_are_read(self, tmp_path, name):
+        """They had variances, and the first ones no mask."""
         solution, *_, exposures, _ = plain()
         noisy = [Exposure(e.name, e.data, uncertainty=np.full(SHAPE, 2.0), header=e.header) for e in exposures]
         mosaic = coadd(noisy, solution)
-        hdus = mosaic.to_hdulist()
-        hdus["UNCERT"].header.remove("UTYPE")
-        hdus["UNCERT"].name = "VAR"
-        for name in ("MASK", "EXTRAPOLATED", "REJECTED"):
-            del hdus[name]
-        hdus.writeto(tmp_path / "old.fits")
+        header = mosaic.to_hdulist()[0].header
+        planes = {name: mosaic.variance, "MASK": np.isnan(mosaic.data).astype("u1"), "WEIGHT": mosaic.weight,
+                  "FOOTPRINT": mosaic.footprint, "FLAGS": mosaic.flags,
+                  "CONTEXT": mosaic.context[0].view("i4")}  # fmt: skip
+        if name == "VAR":
+            del planes["MASK"]
+        hdus = [fits.PrimaryHDU(mosaic.data, header), *(fits.ImageHDU(p, header, name=n) for n, p in planes.items())]
+        if name == "UNCERT":
+            hdus[1].header["UTYPE"] = "VarianceUncertainty"
+        fits.HDUList(hdus).writeto(tmp_path / "old.fits")
         (old,) = read_exposures(tmp_path / "old.fits")
         np.testing.assert_allclose(old.uncertainty**2, mosaic.variance, rtol=1e-5)
+        np.testing.assert_array_equal(old.mask, np.isnan(mosaic.data))
         assert read_grid(tmp_path / "old.fits").array_shape == mosaic.shape
 
     @pytest.mark.parametrize("unit", ["no unit", ""])
@@ -533,7 +544,7 @@ class TestFile:
 
     def test_asdf(self, tmp_path):
         solution, stars, _, exposures, _ = plain()
-        mosaic = coadd(exposures, solution)
+        mosaic = coadd(exposures, solution, planes="all")
         mosaic.write(tmp_path / "m.asdf")
         with asdf.open(tmp_path / "m.asdf", memmap=False) as file:
             tree = file["mosaic"]

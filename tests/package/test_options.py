@@ -391,6 +391,7 @@ COADD = [
     row(extrapolated="mask"),
     row(workers=1, scratch=".", progress=True),
     row(planes=["WEIGHT"]),
+    row(planes="all"),
     row(weights="seeing", refused=dict.fromkeys(MOSAICS, "has no FWHM of stars in every exposure; give a dict")),
 ]
 ATTACH = [

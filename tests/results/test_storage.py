@@ -18,6 +18,7 @@ import pytest
 import written_files
 from astropy import units as u
 from astropy.coordinates import SkyCoord
+from astropy.io import fits
 from astropy.modeling import models
 from astropy.table import MaskedColumn, QTable
 from astropy.time import Time
@@ -804,8 +805,13 @@ def assert_alike(found, expected, where=""):
 
 
 @pytest.mark.parametrize("folder", sorted(written_files.FOLDER.iterdir()), ids=lambda folder: folder.name)
-def test_mosaics_of_every_version_are_grids(folder):
+def test_mosaics_of_every_version_are_grids_and_images(folder):
     assert read_grid(folder / "mosaic.fits").array_shape == (30, 40)
+    (image,) = legdistort.read_exposures(folder / "mosaic.fits")
+    with fits.open(folder / "mosaic.fits") as hdulist:
+        stated = hdulist["UNCERT"]
+        power = {"StdDevUncertainty": 1, "VarianceUncertainty": 2}[stated.header["UTYPE"]]
+        assert_allclose(image.uncertainty**power, stated.data, rtol=1e-6)
 
 
 def test_this_version_has_its_files():

@@ -627,9 +627,9 @@ class TestMosaicInBlocks:
             assert not plane[empty].any()
 
     @pytest.mark.slow
-    def test_the_context_says_who_contributes(self):
+    def test_the_context_says_who_contributes(self, tmp_path):
         solution, exposures = night(34)
-        mosaic = ld.coadd(exposures, solution, order=1)
+        mosaic = ld.coadd(exposures, solution, order=1, planes="all")
         assert mosaic.context.shape == (2, *mosaic.shape)
         bits = np.bitwise_count(mosaic.context).sum(axis=0)
         np.testing.assert_array_equal(bits, mosaic.footprint)
@@ -645,6 +645,8 @@ class TestMosaicInBlocks:
         hdulist = mosaic.to_hdulist()
         assert hdulist["CONTEXT"].data.dtype == np.int32
         np.testing.assert_array_equal(hdulist["CONTEXT"].data.view(np.uint32), mosaic.context)
+        written = fits.getdata(mosaic.write(tmp_path / "m.fits"), "CONTEXT")
+        np.testing.assert_array_equal(written.astype(np.int32).view(np.uint32), mosaic.context)
         with pytest.raises(InputError, match=r"pixel \(-1, 0\) is not one of the \d+ x \d+ of the mosaic"):
             mosaic.contributors(-1, 0)
 
