@@ -95,13 +95,38 @@ def row(words, n, *, one=True):
     return {name: np.array(each) for name, each in sums.items() if each}
 
 
+def motions(n_nights, n, **how):
+    """Squared pull of absolute motions over n sets of some nights that differ in nothing but a turn, and by set."""
+    sums = []
+    for seed in range(n):
+        nights = Nights(seed, nights=n_nights, nightly=0.0, single=0.0, motion=0.02, n_stars=120)
+        given = ld.Matches.from_table(nights.table, shape=(SIZE, SIZE))
+        stars = ld.solve(given, motion="auto", **how).stars
+        stars = stars[np.asarray(stars["n_epochs"]) > 1]
+        z, v = (stars[x].value + 1j * stars[y].value for x, y in ("xy", ("vx", "vy")))
+        off = v - nights.motion[np.asarray(stars["star"], int)] @ [1, 1j]
+        common = np.stack([np.ones(len(z)), z - z.mean()], axis=1)
+        off = off - common @ np.linalg.lstsq(common, off, rcond=None)[0]
+        sums.append([np.sum(np.abs(off) ** 2), np.sum(stars["vx_err_abs"].value ** 2 + stars["vy_err_abs"].value ** 2)])
+    off, stated = np.array(sums).T
+    return off.sum() / stated.sum(), off / stated
+
+
 def main():
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sets", type=int, default=20)
     parser.add_argument("--only", nargs="*", default=list(SETTINGS))
     parser.add_argument("--names", action="store_true", help="alone: nothing is taken for one night")
+    parser.add_argument("--motions", action="store_true", help="motions alone, of two to five nights, as static='fit'")
     asked = parser.parse_args()
+    if asked.motions:
+        for static in ("fit", None):
+            for n_nights in (2, 3, 4, 5):
+                pooled, single = motions(n_nights, asked.sets, **({"static": static} if static else {}))
+                sets = f"single sets {single.min():9.4f} to {single.max():.4f}"
+                print(f"static={static} {n_nights} nights {pooled:9.4f}   {sets}", flush=True)
+        return
     heads = "pull^2", "finite", "one", "finite", "rms", "without", "named", "false", "twice"
     heads += "median", "rms", "most"
     print(f"{'':36} " + " ".join(f"{head:>7}" for head in heads))
