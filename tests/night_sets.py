@@ -27,6 +27,8 @@ class Nights:
         Size of what the lists of a night have in common, and of what each adds [pix].
     odd : float
         Size of what those of one night have in common in its place.
+    odd_ones : tuple of int, optional
+        Nights that are odd, each in its own way; the middle one by default.
     roll : float
         Of the last third of the nights, degrees.
     motion : float
@@ -40,15 +42,16 @@ class Nights:
     """
 
     def __init__(self, seed, *, nights=8, per=5, nightly=0.02, single=0.01, odd=0.0, roll=30.0, motion=0.0, sigma=0.03,
-                 n_stars=200, degree=DEGREE, alone=False):  # fmt: skip
+                 n_stars=200, degree=DEGREE, alone=False, odd_ones=None):  # fmt: skip
         rng = np.random.default_rng(seed)
         self.sky = rng.uniform(-120, SIZE + 120, (n_stars, 2))
         self.motion = rng.normal(0, motion, (n_stars, 2))
         self.static, rows = field(rng, STATIC, degree), []
         self.odd, self.common = nights // 2, []
+        odd_ones = (self.odd,) if odd_ones is None else odd_ones
         years = np.linspace(2014.4, 2020.6, nights) if nights > 1 else [2014.4]
         for i, year in enumerate(years):
-            common = field(rng, odd if odd and i == self.odd else nightly, degree)
+            common = field(rng, odd if odd and i in odd_ones else nightly, degree)
             self.common.append(common)
             for k in range(1 if alone and i == self.odd else per):
                 angle = np.radians(rng.normal(0, 0.05) + roll * (i >= nights - max(1, nights // 3)))

@@ -500,6 +500,11 @@ class Gauge(ShownAsPrinted):
             )
         lines += [self.warning[0].upper() + self.warning[1:] + "."] if self.warning else []
         lines += [] if self.drift is None else [str(self.drift)]
+        if self.drift is not None and not (self.drift.n_tied or self.nights_told) and self.static == "fitted":
+            lines.append(
+                "Too few nights tell such a map of motions from the static distortion that all exposures share: the "
+                "absolute error of a motion may be many times too small or too large."
+            )
         if self.static == "open":
             return "\n".join(lines)
         dynamic = np.sqrt(np.sum(self.scatter**2) / 8)

@@ -62,6 +62,20 @@ def test_what_the_last_steps_keep_moves_no_star(known, direct, loss, monkeypatch
     assert np.allclose(new.stars["x_err"], old.stars["x_err"], rtol=1e-4)
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_conjugate_gradients_keep_to_the_constraints_up_to_rounding(seed, monkeypatch):
+    """Some of the many small steps with a robust loss went far along what nothing determines, without end."""
+    sim, found = simulate_matches(n_exposures=20, n_stars=100, seen=0.7, sigma=0.05, seed=seed), {}
+    for direct in (True, False):
+        monkeypatch.setattr(minimisers.reduced_system, "uses_direct", lambda problem, direct=direct: direct)
+        found[direct] = solve(sim.matches, loss="cauchy", clip=None)
+    steps = {direct: int(re.search(r"converged after (\d+)", each.status).group(1)) for direct, each in found.items()}
+    assert abs(steps[True] - steps[False]) <= 2
+    pose = similarity.fit_similarity(found[False].estimate.positions, found[True].estimate.positions)
+    off = similarity.apply(pose, found[False].estimate.positions) - found[True].estimate.positions
+    assert np.abs(off).max() < 1e-2 * found[True].stars["x_err"].value.min()
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_coefficients_fitted_to_the_start_values_of_the_stars_save_steps_and_move_no_star(known, monkeypatch):
     sim = simulate_matches(n_exposures=12, n_stars=80, seen=0.8, sigma=0.05, dither=150.0, seed=2)

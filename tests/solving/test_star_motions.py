@@ -116,6 +116,15 @@ def test_motions_show_between_two_nights_that_are_turned(seed, motion):
     assert solution.chi2 / solution.dof < 1.1
 
 
+@pytest.mark.parametrize(("n_nights", "told"), [(2, False), (3, False), (4, True)])
+@pytest.mark.filterwarnings("ignore:static='fit'. . of 14 unknowns")
+def test_few_nights_with_one_static_distortion_say_that_errors_of_motions_are_unsure(n_nights, told):
+    """Of two the squares are some 80 times those stated, of four or more about those."""
+    nights = Nights(1, nights=n_nights, per=4, nightly=0.0, single=0.0, motion=0.02, n_stars=100)
+    solution = solve(Matches.from_table(nights.table, shape=(SIZE, SIZE)), motion="auto", static="fit")
+    assert ("error of a motion may be many times too small or too large" in str(solution.gauge)) != told
+
+
 def test_a_star_that_two_epochs_have_move_unlike_all_others_is_named():
     """One of its positions is that of another star, and no third one tells."""
     nights = Nights(2, nights=4, per=2, n_stars=60, motion=0.3, roll=0.7)

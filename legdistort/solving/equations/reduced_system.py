@@ -302,11 +302,11 @@ class Iterative(Reduced):
 
     For problems in which exposures share nothing.
 
-    Projected conjugate gradients with the constraint preconditioner of Gould, Hribar & Nocedal (2001): every
-    iterate satisfies the constraints. The coupling E d of the iterate is carried along, so that neither the
-    right-hand side nor the stars need a pass of their own. Directions that are common to all exposures, and that the
-    constraints hardly hold, take most of the iterations; what these tell of them is kept for the system at the next
-    state, as a limited-memory preconditioner (Tshimanga, Gratton, Weaver & Sartenaer 2008).
+    Projected conjugate gradients with the constraint preconditioner of Gould, Hribar & Nocedal (2001), its iterative
+    refinement with it: every iterate satisfies the constraints. The coupling E d of the iterate is carried along, so
+    that neither the right-hand side nor the stars need a pass of their own. Directions that are common to all
+    exposures, and that the constraints hardly hold, take most of the iterations; what these tell of them is kept for
+    the system at the next state, as a limited-memory preconditioner (Tshimanga, Gratton, Weaver & Sartenaer 2008).
     """
 
     moves_exactly = True  # but for the preconditioner all is that of the new state
@@ -376,7 +376,9 @@ class Iterative(Reduced):
 
         def precondition(r):
             z = self._block_solve(r)
-            return z - lifted @ (border @ (rows @ z))
+            for _ in range(2):  # the second takes off what rounding leaves, which conjugate gradients would follow
+                z = z - lifted @ (border @ (rows @ z))
+            return z
 
         d = lifted @ (border @ target)
         if target.any():

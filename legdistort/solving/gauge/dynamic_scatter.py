@@ -92,8 +92,8 @@ def _of_nights(problem, own, variance, counts, moved, night, group, static):
     total = _sums(weight, night) + 1e-300
     means, moved = _sums(weight * own, night) / total, _sums(weight[:, :, None] * moved, night) / total[:, :, None]
     owner, counts = group[np.unique(night, return_index=True)[1]], _sums(weight, night) > 0
-    left, leverage = _fitted(*_common(means, moved, owner, static), counts * total, means)
-    dof = np.maximum(counts.sum(axis=0) - leverage, 0.0).sum()
+    left, variance = _fitted(*_common(means, moved, owner, static), counts * total, means)
+    dof = np.maximum(counts.sum(axis=0) - (counts * total * variance).sum(axis=0), 0.0).sum()
     if dof > 1 and np.sum(counts * total * left**2) < dof + SEEN * np.sqrt(2 * dof):
         return scatter2, np.zeros(shape), True
     falling = _falling(scatter2)
@@ -148,13 +148,13 @@ def _scatter(own, variance, counts, moved, owner, static, *, robust=False):
     for _ in range(_ROUNDS if own.size else 0):
         wide = odd[:, None] ** 2
         weight = counts / (variance + wide * scatter2 + 1e-300)
-        left, leverage = _fitted(design, stated, weight, own)
-        dof = np.maximum(counts.sum(axis=0) - leverage, 0.0)
+        left, fitted = _fitted(design, stated, weight, own)
+        dof = np.maximum(counts.sum(axis=0) - (weight * fitted).sum(axis=0), 0.0)
         terms = left / odd[:, None], variance / wide, counts
         new = _pooled(_by_degree(*terms, dof) if robust else _excess(*terms, dof), dof, np.mean(own**2))
         change, scatter2 = np.abs(new - scatter2).max(initial=0), new
         if robust:
-            before, odd = odd, _oddness(left, variance, counts, wide, new)
+            before, odd = odd, _oddness(left, variance, fitted, counts, wide, new)
             change = max(change, np.abs(np.log(odd / before)).max() * new.max(initial=0))
         if change <= 1e-3 * new.max(initial=0):  # equal where exposures do not scatter, as at a start
             break
@@ -170,13 +170,19 @@ def _by_degree(left, variance, counts, dof):
     return out
 
 
-def _oddness(left, variance, counts, wide, scatter2):
-    """Factors (n,) on the scatter of values (n, K), as for Student's t distribution (Lange, Little & Taylor 1989)."""
+def _oddness(left, variance, fitted, counts, wide, scatter2):
+    """Factors (n,) on the scatter of values (n, K), as for Student's t distribution (Lange, Little & Taylor 1989).
+
+    The variance of what was `fitted` to a value counts: what a night draws to itself tells nothing of how odd it is.
+    One where the squares are no larger than by chance, from there on without a jump, and those of the distribution from
+    twice that excess on.
+    """
     prior = wide * scatter2 + 1e-300
     share = prior / (prior + variance)
-    square = (counts * ((share * left) ** 2 + share * variance) / (prior / wide)).sum(axis=1)
+    square = (counts * (share**2 * (left**2 + fitted) + share * variance) / (prior / wide)).sum(axis=1)
     count = counts.sum(axis=1)
-    return np.sqrt(np.where(square > count + CHANCE * np.sqrt(2 * count), (TAILS + square) / (TAILS + count), 1))
+    beyond = (square - count) / (CHANCE * np.sqrt(2 * count) + 1e-300)
+    return ((TAILS + square) / (TAILS + count)) ** (np.clip(beyond - 1, 0, 1) / 2)
 
 
 def _sums(values, label):
@@ -187,7 +193,7 @@ def _sums(values, label):
 
 
 def _fitted(design, stated, weight, own):
-    """What a weighted fit leaves of values (n, K), and the leverage of the fit by mode (K,).
+    """What a weighted fit leaves of values (n, K), and the variance of what was fitted to each.
 
     `stated` is the inverse variance that is known beforehand of every column of the design.
     """
@@ -196,7 +202,7 @@ def _fitted(design, stated, weight, own):
     determined = curvature > 1e-10 * curvature.max(initial=0)
     columns = columns @ (vectors[:, determined] / np.sqrt(curvature[determined]))
     left = own - (columns @ (columns.T @ (weight.ravel() * own.ravel()))).reshape(own.shape)
-    return left, np.sum(weight * columns**2, axis=1).reshape(own.shape).sum(axis=0)
+    return left, np.sum(columns**2, axis=1).reshape(own.shape)
 
 
 def _pooled(variance, dof, largest):
