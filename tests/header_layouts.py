@@ -34,10 +34,12 @@ class Night:
         Of the positions [pix].
     static : float
         Distortion of the focal plane that all exposures share, as `size` of those that each has [pix].
+    own : float
+        Distortions that each detector has of its own in all exposures, as `size` [pix].
     """
 
     def __init__(self, seed, *, off=2.5, turn=0.0, dither=80.0, n=9, n_stars=450, rolls=(0.0,), sigma=0.01, size=0.3,
-                 odd=(0.0, 0.0, 0.0), static=0.0):  # fmt: skip
+                 odd=(0.0, 0.0, 0.0), static=0.0, own=0.0):  # fmt: skip
         rng = np.random.default_rng(seed)
         self.sky = rng.uniform(-60, 2 * MIDDLE + 60, (n_stars, 2))
         flux = 10 ** rng.uniform(3.5, 5.5, n_stars)
@@ -47,18 +49,19 @@ class Night:
         self.places = np.array([_place(corner, np.zeros(2), 0.0) for corner in CORNERS])
         self.stated = np.array([_place(c, *w) for c, *w in zip(CORNERS, *self.wrong, strict=True)])
         common = np.random.default_rng((seed, 1)).normal(0, static / 2, (10, 2))
+        alone = np.random.default_rng((seed, 2)).normal(0, own / 2, (4, 10, 2))
         rows, self.exposures, self.focal, self.flux = [], [], [], flux
         for i in range(n):
             shift, angle = rng.uniform(-dither, dither, 2) * (i > 0), np.radians(rolls[i % len(rolls)])
             roll = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
             f = (self.sky - MIDDLE) @ roll.T + MIDDLE + shift
             t = f / MIDDLE - 1
-            powers = np.stack([t[:, 0] ** a * t[:, 1] ** b for a in range(4) for b in range(4 - a)], axis=1)
-            f = f + powers @ (common + rng.normal(0, size / 2, (10, 2)))
+            f = f + _powers(t) @ (common + rng.normal(0, size / 2, (10, 2)))
             self.focal.append(f)
             pointing = rng.normal(0, 3, 2)  # of the header
-            for key, place, stated in zip(KEYS, self.places, self.stated, strict=True):
-                xy = f @ place[:, :2].T + place[:, 2] + rng.normal(0, sigma, f.shape)
+            for key, place, stated, modes in zip(KEYS, self.places, self.stated, alone, strict=True):
+                xy = f @ place[:, :2].T + place[:, 2]
+                xy = xy + _powers(np.clip(2 * xy / SIZE - 1, -1.2, 1.2)) @ modes + rng.normal(0, sigma, f.shape)
                 for j in np.flatnonzero(np.all((xy > 0) & (xy < SIZE - 1), axis=1)):
                     rows.append((f"e{i}", key, *xy[j], sigma, sigma, flux[j], j))
                 header = _header(key, i, stated, roll, shift + pointing)
@@ -154,6 +157,11 @@ def _mapped(source, target, errors, degree):
         for t, e in zip(target.T, errors.T, strict=True)
     ]
     return np.stack(out, axis=1)
+
+
+def _powers(t):
+    """x^a y^b up to degree 3 (n, 10) of positions (n, 2)."""
+    return np.stack([t[:, 0] ** a * t[:, 1] ** b for a in range(4) for b in range(4 - a)], axis=1)
 
 
 def _place(corner, moved, degrees):

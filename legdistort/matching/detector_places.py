@@ -80,6 +80,34 @@ def nearer(camera, xy, exposure, detector, star, flux=None):
     ndarray, shape (n, 2), or None
         None where no two detectors see the same stars.
     """
+    placed = _placed(camera, xy, exposure, detector, star, flux)
+    if placed is None:
+        return None
+    maps = placed[1].reshape(-1, 2, 3)[detector]
+    return xy + np.einsum("nak,nk->na", maps, _arms(camera, xy, detector))
+
+
+def with_crossing(camera, xy, exposure, detector, star, flux=None):
+    """Numbers of stars (n,) in which one that was two, each on detectors of its own, has the lower number.
+
+    Arguments are those of `nearer`. Distortions that each detector has of its own are not smooth over a gap, and leave
+    the exposures of a star that are on one side of it apart from those on the other. Two such parts are nearest to each
+    other on the plane, and in no exposure at once, as two stars would be.
+    """
+    star, placed = star.copy(), _placed(camera, xy, exposure, detector, star, flux)
+    if placed is None:
+        return star
+    seen, change, pairs = placed
+    near = _neighbours(seen, seen.slopes(len(camera.detectors)) @ change, _joined(seen, pairs), RADII[1])
+    pairs = near[seen.can_be_one(near)]
+    for one, two in np.sort(seen.star[pairs], axis=1):
+        if one >= 0 and one != two and not np.intersect1d(exposure[star == one], exposure[star == two]).size:
+            star[star == two] = one
+    return star
+
+
+def _placed(camera, xy, exposure, detector, star, flux):
+    """The `_Seen`, affine maps of detectors that bring its stars together, and pairs (n, 2) of its rows; or None."""
     arms, bright = _arms(camera, xy, detector), np.full(len(xy), np.nan) if flux is None else _logarithm(flux)
     rows = np.isin(exposure, exposure[star >= 0])  # others have no pose
     seen = _seen(camera, *(each[rows] for each in (xy, exposure, detector, star, arms, bright)))
@@ -97,7 +125,7 @@ def nearer(camera, xy, exposure, detector, star, flux=None):
             pairs = _neighbours(seen, slopes @ change, joined, min(max(4 * scale, 0.5), RADII[-1]))
             if len(pairs) < 2:
                 return None
-    return xy + np.einsum("nak,nk->na", change.reshape(-1, 2, 3)[detector], arms) if len(pairs) else None
+    return (seen, change, pairs) if len(pairs) else None
 
 
 def _logarithm(flux):
@@ -111,7 +139,7 @@ class _Seen:
 
     `xy` (n, 2) on a common plane, `detector`, `turned` and `group` (n,) of both: the orientation; `arms` (n, 3), and
     how the plane follows the focal plane, `turn` (n, 2, 2); `bright` (n,) the logarithm of the flux, NaN for none, and
-    whether an exposure shows the star, `exposures` (n, n_exposures).
+    whether an exposure shows the star, `exposures` (n, n_exposures). `star` (n,) is its number, -1 for none.
     """
 
     xy: np.ndarray
@@ -122,6 +150,7 @@ class _Seen:
     turn: np.ndarray
     bright: np.ndarray
     exposures: np.ndarray
+    star: np.ndarray
 
     def can_be_one(self, pairs):
         """Which pairs (n, 2) of rows may be one star: alike in flux, and in no exposure at once, bool (n,)."""
@@ -182,7 +211,8 @@ def _seen(camera, xy, exposure, detector, star, arms, bright):
     shows = np.zeros((len(count), len(poses)), dtype=bool)
     shows[node, exposure] = True
     bright = mean(_at_one_level(bright, exposure, star)[:, None])[:, 0]
-    return _Seen(mean(on_plane), detector[first], orientation, group[first], mean(arms), turn, bright, shows)
+    return _Seen(mean(on_plane), detector[first], orientation, group[first], mean(arms), turn, bright, shows,
+                 np.where(known, star, -1)[first])  # fmt: skip
 
 
 def _at_one_level(bright, exposure, star):

@@ -273,7 +273,8 @@ def _label_over_gaps(table, names, shapes, headers, options, camera, edges):
                 AssumptionWarning,
             )
             break
-    return found
+    star = np.concatenate([found[0], alone])
+    return detector_places.with_crossing(camera, _positions(moved), exposure, detector, star, flux)[:rows], found[1]
 
 
 def _positions(table):

@@ -34,17 +34,13 @@ if TYPE_CHECKING:
 EVIDENCE = "evidence"
 #: As `prior` of `legdistort.run`: that of the headers of the frames.
 HEADER = "header"
+#: Degree to which a size of the static distortion is taken where exposures scatter by a given number of pixels.
+_HIGHEST = 9
 _WIDTHS = array(2, "n_modes", unit="pix", minimum=0, infinite=True, choices=(EVIDENCE,))
 
 
-def _declared(sigma, static_sigma):
+def _declared(static_sigma):
     """The size of a static distortion of which nothing else is known, a positive number."""
-    if not (sigma is None or (isinstance(sigma, str) and sigma == EVIDENCE)):
-        raise InputError(
-            "sigma is the scatter of exposures around a mean: where static_sigma states but the size of the static "
-            "distortion it is found with it; leave out sigma (--prior-sigma) or static_sigma (--static-sigma), or give "
-            "the mean (--prior)"
-        )
     given = isinstance(static_sigma, Real) and not isinstance(static_sigma, bool)
     if not (given and 0 < static_sigma < np.inf):
         raise InputError(
@@ -74,7 +70,8 @@ class Prior(ShownAsPrinted):
         the mean as exact, infinity means that nothing is known of a mode. Without a mean, a number s: every coefficient
         of the degree d that is fitted is about that large, in pixels, either sign. This makes
         ``s sqrt(((d + 1) (d + 2) - 4) / 8)`` px of distortion, rms per axis over the detector, shift, rotation and
-        scale aside: s at degree 2, 1.4 s at 3, 1.8 s at 4, 2.2 s at 5; the scatter of exposures is then found.
+        scale aside: s at degree 2, 1.4 s at 3, 1.8 s at 4, 2.2 s at 5; the scatter of exposures is then found, or it
+        is `sigma`, about a static distortion of that size.
     static_covariance : array_like, shape (2 n_modes, 2 n_modes), optional
         The covariance of the mean, those of x first, px^2, in the place of `static_sigma`, which its diagonal becomes:
         what several coefficients have in common, such as maps that dithers without a roll do not tell, then leaves
@@ -145,9 +142,14 @@ class Prior(ShownAsPrinted):
         if self.mean is None:
             if self.static_covariance is not None:
                 raise InputError("static_covariance is that of a mean: give the mean as well")
-            object.__setattr__(self, "static_sigma", _declared(self.sigma, self.static_sigma))
-            object.__setattr__(self, "sigma", None)  # which is found
-            return
+            size = _declared(self.static_sigma)
+            object.__setattr__(self, "static_sigma", size)
+            if self.sigma is None or is_sought:
+                object.__setattr__(self, "sigma", None)  # which is found
+                return
+            n_modes = np.shape(self.sigma)[-1] if np.ndim(self.sigma) else basis.n_modes(_HIGHEST)
+            object.__setattr__(self, "mean", np.zeros((2, n_modes)))  # about which exposures scatter by sigma
+            object.__setattr__(self, "source", UNSTATED)
         try:
             mean = np.array(self.mean, dtype=float)
         except (TypeError, ValueError):
@@ -186,7 +188,7 @@ class Prior(ShownAsPrinted):
         """
         if self.mean is None:
             return np.full((2, basis.n_modes(degree)), self.static_sigma)
-        if self.source == UNSTATED:
+        if self.source == UNSTATED and self.static_sigma is None:
             return np.full((2, basis.n_modes(degree)), np.inf)
         return basis.change_degree(np.zeros((2, 1)) if self.static_sigma is None else self.static_sigma, degree)
 

@@ -422,8 +422,9 @@ def held(matches, layout, static):
 def with_declared_size(matches, prior, static, *, dynamic, degree):
     """Matches whose detectors have the size of their static distortions that a prior without a mean declares.
 
-    As uncertainty of what they state, with which it is fitted. Also what is left of the prior, that the scatter of
-    exposures is found, and what is done about static distortions. Other priors, and those of plain images, stay.
+    As uncertainty of what they state, with which it is fitted. Also what is left of the prior, the scatter of
+    exposures, found where none is given, and what is done about static distortions. Other priors, and those of
+    plain images, stay.
 
     Raises
     ------
@@ -441,10 +442,13 @@ def with_declared_size(matches, prior, static, *, dynamic, degree):
     degree, detectors = 3 if isinstance(degree, str) else degree, {}
     for key, each in matches.camera.detectors.items():
         known = basis.change_degree(each.static, max(degree, basis.degree_of(each.static.shape[1])))
-        sigma = np.where(np.arange(known.shape[1]) < 3, 0.0, np.full(known.shape, prior.static_sigma))
+        sigma = np.where(np.arange(known.shape[1]) < 3, 0.0, np.full(known.shape, np.max(prior.static_sigma)))
         detectors[key] = replace(each, static=known, static_sigma=sigma, static_covariance=None)
     matches = replace(matches, camera=replace(matches.camera, detectors=detectors))
-    return matches, None if dynamic == "detector" else Prior(None, sigma="evidence"), static and "prior"
+    scatter = Prior(None, sigma="evidence")
+    if prior.sigma is not None:
+        scatter = scatter.with_sigma(prior.sigma, degree=degree)
+    return matches, None if dynamic == "detector" else scatter, static and "prior"
 
 
 def in_camera(matches, camera):

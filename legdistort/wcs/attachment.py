@@ -170,8 +170,9 @@ def attach(
         )  # fmt: skip
     if unknown := _unknown_sky(solution):
         log.warning("%s", unknown)
+    attached = {images.views[name].name for plan in plans for name in plan.headers}
     for check in solution.checks:
-        if check.name == "extrapolation" and check.state != "pass":
+        if check.name == "extrapolation" and check.state != "pass" and _is_of(check, attached):
             log.warning("%s; that is so in their WCSs too", check.sentence)
     if alike := [f"{plan.path.name} as {v.name}" for plan in plans for v in map(images.views.get, plan.headers)
                  if _is_another_product(plan.path, v)]:  # fmt: skip
@@ -193,6 +194,14 @@ def attach(
             with writing(plan.target) as file:
                 plan.write(file)
     return [Attachment(plan.target, *item, kind) for plan in plans for item in plan.headers.items()]
+
+
+def _is_of(check, names):
+    """Whether what a check found is of one of these exposures: named, or perhaps one of the unnamed rest."""
+    if re.search(r" and \d+ more", check.sentence):
+        return True
+    named = map(re.escape, names)
+    return any(re.search(rf"(?<!\S)({name} \(error|\({name}\))", check.sentence) for name in named)
 
 
 def _is_another_product(path, view):

@@ -98,3 +98,18 @@ def test_detectors_without_a_common_star_stay():
     exposure = np.unique(matches.table["exposure"], return_inverse=True)[1]
     detector = np.unique(matches.table["detector"], return_inverse=True)[1]
     assert detector_places.nearer(camera, xy, exposure, detector, np.asarray(matches.table["star"])) is None
+
+
+@pytest.mark.parametrize("solved", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_detectors_with_distortions_of_their_own_share_their_stars(solved):
+    """Which are not smooth over the gap: no star twice, also where two exposures are enough for one, and solved so."""
+    night = header_layouts.Night(5, off=0.0, n=6, n_stars=300, own=2.0)
+    matches = legdistort.match(night.table, exposures=night.exposures, min_exposures=2)
+    night.found(matches)  # no two in one
+    star, true = np.asarray(matches.table["star"]), np.asarray(matches.table["true"])
+    assert len(np.unique(star)) == len(np.unique(true))
+    if solved:
+        solution = legdistort.solve(matches, degree=3, static="fit", layout="fit")
+        assert len(solution.stars) == len(np.unique(true))
+        left = np.hypot(*(solution.residuals[name].value for name in ("dx", "dy")))
+        assert np.median(left) < 0.02

@@ -3,6 +3,7 @@
 import json
 import logging
 
+import gsaoi_images
 import numpy as np
 import pytest
 from astropy.table import QTable
@@ -16,6 +17,7 @@ from legdistort.geometry import basis
 from legdistort.geometry.detector_modes import dynamic_basis
 from legdistort.reporting.page import render
 from legdistort.results import accuracy
+from legdistort.solving import camera_fit
 from legdistort.solving.equations.problem import build_problem
 
 SETTING = {"n_exposures": 8, "n_stars": 50, "degree": 3, "sigma": 0.02, "dither": 150.0, "zero_mean": False}
@@ -111,14 +113,35 @@ def test_scatter_alone_is_found_about_what_exposures_show(tmp_path):
         assert not each.states_mean
 
 
-def test_scatter_needs_a_mean():
-    with pytest.raises(InputError, match=r"found with it; leave out sigma \(--prior-sigma\) or static_sigma"):
+def test_scatter_alone_of_so_many_pixels_needs_a_mean():
+    with pytest.raises(InputError, match="without a mean, static_sigma must be a positive number"):
         ld.Prior(None, sigma=0.3)
-    with pytest.raises(InputError, match="sigma is the scatter of exposures around a mean"):
-        ld.Prior(None, sigma=0.3, static_sigma=2.0)
     declared = ld.Prior(None, static_sigma=2.0)
     assert repr(declared.with_sigma("evidence")) == repr(declared)
     assert declared.with_sigma("evidence").sigma is None
+    assert repr(declared.with_sigma(0.3)) == "<Prior: not known, sigma given, static_sigma given>"
+
+
+@pytest.mark.parametrize("sigma", [0.3, np.full(10, 0.3)])
+def test_scatter_about_a_static_distortion_of_a_size(sigma, sim):
+    """The exposures depart by sigma from what is about zero by the size, as the plain mean of zeros has it."""
+    both = ld.Prior(None, sigma=sigma, static_sigma=2.0)
+    assert not both.states_mean
+    plain = ld.Prior(np.zeros((2, 10)), sigma=0.3, static_sigma=2.0)
+    one, two = (ld.solve(sim.matches, prior=prior) for prior in (both, plain))
+    for name in ("x", "y", "x_err", "x_err_abs", "y_err_abs"):
+        assert_allclose(one.stars[name].value, two.stars[name].value, rtol=0, atol=1e-6)
+
+
+def test_scatter_beside_a_size_of_several_detectors_is_of_exposures():
+    table = gsaoi_images.Night(n_exposures=4, n_stars=60, dither=9.0).table(sigma=0.01, least=2)
+    matches = ld.Matches.from_table(table, camera=ld.Camera.gsaoi())
+    declared = ld.Prior(None, sigma=0.1, static_sigma=0.5)
+    made, scatter, static = camera_fit.with_declared_size(matches, declared, "fit", dynamic=None, degree=3)
+    assert static == "prior"
+    assert scatter.static_sigma is None
+    assert_array_equal(scatter.sigma, 0.1)
+    assert_array_equal(made.camera["2"].static_sigma[:, 3:], 0.5)
 
 
 def test_prior_says_what_it_is():

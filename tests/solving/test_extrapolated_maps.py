@@ -9,7 +9,9 @@ from astropy.table import Table
 
 import legdistort as ld
 from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.results.check import Check
 from legdistort.solving.checks import extrapolated_maps
+from legdistort.wcs import attachment
 from legdistort.wcs.attachment import attach
 
 SIDE, NOISE = 1024, 0.02
@@ -69,14 +71,26 @@ def test_half_an_overlap_is_no_fault():
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.AssumptionWarning")
 def test_attach_says_it_in_one_line(tmp_path, caplog):
     plane = TangentPlane(85.0, -70.0, np.array([[-2e-5, 0, 0.01], [0, 2e-5, -0.01]]))
-    for far, told in ((700.0, 1), (250.0, 0)):
+    for far, name, told in ((700.0, "e6", 1), (700.0, "e0", 0), (250.0, "e6", 0)):  # of the frames attached alone
         solution = ld.solve(night(far, sky=plane))
-        fits.writeto(tmp_path / "e0.fits", np.zeros((SIDE, SIDE), "float32"), overwrite=True)
+        fits.writeto(tmp_path / f"{name}.fits", np.zeros((SIDE, SIDE), "float32"), overwrite=True)
         caplog.clear()
-        attach(solution, [tmp_path / "e0.fits"], out=tmp_path / f"out{far:.0f}")
+        attach(solution, [tmp_path / f"{name}.fits"], out=tmp_path / f"out{far:.0f}{name}")
         lines = [record.getMessage() for record in caplog.records if "hardly determined" in record.getMessage()]
         assert len(lines) == told
         assert all("e6 (error up to" in line and line.endswith("that is so in their WCSs too") for line in lines)
+
+
+def test_a_check_is_of_the_exposures_that_it_names():
+    def is_of(sentence, *names):
+        return attachment._is_of(Check("extrapolation", "warn", 1.0, 0.5, sentence), names)
+
+    some = "hardly determined, where few stars join it to the others: e6-1 (error up to 2 px), n.2 (error up to 1 px)"
+    assert is_of(some, "e0", "n.2")
+    assert is_of(some, "e6-1")
+    assert not is_of(some, "e6", "1", "nx2", "e0")
+    assert is_of(f"{some} and 2 more", "e0")
+    assert is_of("up to 60% of a frame lies outside its stars, where distortions are extrapolated (e6)", "e6")
 
 
 @pytest.mark.parametrize(("dynamic", "whole"), [("detector", "e6"), (None, "e6-H2RG-1")])
