@@ -14,33 +14,33 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 
-from ..cameras import storage as camera_files
-from ..cameras.camera import Camera
-from ..cameras.detector import Detector
-from ..cameras.stated_errors import FREE, UNKNOWN
-from ..exceptions import AssumptionWarning, InputError, some_of, warn
-from ..geometry import basis, detector_modes, epochs
-from ..inputs.table_files import records
-from ..plots.memory_plots import plot_memory
-from ..priors.mode_tables import mode_table
-from ..priors.prior import Prior
-from ..results.solution import Solution
-from ..runtime import asdf_files, provenance
-from ..runtime.guards.units import plain_numbers
-from ..runtime.notebook import ShownAsPrinted
-from ..runtime.outputs import replacing
-from ..runtime.parallel import map_items
-from ..runtime.trees import codec
-from ..runtime.trees.facts import SIZE, array, number
+from ...cameras import storage as camera_files
+from ...cameras.camera import Camera
+from ...cameras.detector import Detector
+from ...cameras.stated_errors import FREE, UNKNOWN
+from ...exceptions import AssumptionWarning, InputError, some_of, warn
+from ...geometry import basis, detector_modes, epochs
+from ...inputs.table_files import records
+from ...plots.memory_plots import plot_memory
+from ...priors.mode_tables import mode_table
+from ...priors.prior import Prior
+from ...results.solution import Solution
+from ...runtime import asdf_files, provenance
+from ...runtime.guards.units import plain_numbers
+from ...runtime.notebook import ShownAsPrinted
+from ...runtime.outputs import replacing
+from ...runtime.parallel import map_items
+from ...runtime.trees import codec
+from ...runtime.trees.facts import SIZE, array, number
+from ..known_maps import DETERMINED, KEPT, MEAN_SQUARE, chance
 from .combined_nights import Chain, contradiction, fitted, own_scatter2
-from .known_maps import DETERMINED, KEPT, MEAN_SQUARE, chance
 from .night_data import EXACT, Night, check_nights, check_numbers, dates_of, given_by, night_of, standard_numbers
 
 if TYPE_CHECKING:
     from astropy.time import Time
     from matplotlib.figure import Figure
 
-    from ..runtime.annotations import StrPath
+    from ...runtime.annotations import StrPath
 
 #: Version of the layout under ``legdistort_nights``, and that entry of a file.
 LAYOUT, ROOT = 1, "legdistort_nights"

@@ -6,13 +6,13 @@ from functools import cached_property
 import numpy as np
 from scipy import linalg, sparse
 
-from ..cameras.stated_errors import FREE
-from ..solving.gauge.dynamic_scatter import CHANCE, TAILS
-from ..solving.knowledge.exposures import RANGE
-from ..solving.knowledge.factors import GIVEN, Factor
-from ..solving.knowledge.posterior import most_likely
-from ..solving.knowledge.reduced_data import ReducedData, drawn
-from .known_maps import DETERMINED, KEPT
+from ...cameras.stated_errors import FREE
+from ...solving.gauge.dynamic_scatter import CHANCE, TAILS
+from ...solving.knowledge.exposures import RANGE
+from ...solving.knowledge.factors import GIVEN, Factor
+from ...solving.knowledge.posterior import most_likely
+from ...solving.knowledge.reduced_data import ReducedData, drawn
+from ..known_maps import DETERMINED, KEPT
 
 _EXACT = 1e-6  # scatter of one night, of which nothing tells [pix]
 _MOST, _FEWEST = 600, 12  # unknowns from which sizes are found, and nights, if there are as many

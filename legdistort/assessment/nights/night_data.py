@@ -7,15 +7,15 @@ from dataclasses import KW_ONLY, dataclass, field
 import numpy as np
 from astropy import units as u
 
-from ..cameras.stated_errors import StaticErrors
-from ..exceptions import AssumptionWarning, InputError, some_of, warn
-from ..geometry import basis, detector_modes
-from ..inputs import column_contract
-from ..inputs.repetitions import fingerprints
-from ..priors.prior import Prior
-from ..results.solution import Solution
-from ..runtime.trees.facts import array, number
-from .known_maps import shown_by, sound
+from ...cameras.stated_errors import StaticErrors
+from ...exceptions import AssumptionWarning, InputError, some_of, warn
+from ...geometry import basis, detector_modes
+from ...inputs import column_contract
+from ...inputs.repetitions import fingerprints
+from ...priors.prior import Prior
+from ...results.solution import Solution
+from ...runtime.trees.facts import array, number
+from ..known_maps import shown_by, sound
 
 #: Error of a coefficient [pix] of a map that states none: that of a header as `legdistort attach` writes it.
 EXACT = 1e-3
@@ -210,7 +210,7 @@ def standard_numbers(nights):
 
 
 def given_by(nights, rows, unit):
-    """What nights see, as `legdistort.assessment.combined_nights.fitted` takes it, with slopes by a unit."""
+    """What nights see, as `legdistort.assessment.nights.combined_nights.fitted` takes it, with slopes by a unit."""
     out = []
     for each in nights:
         around, k = rows @ each.around.ravel(), len(rows)
