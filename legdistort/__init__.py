@@ -9,9 +9,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors read; `_PLACES` states the same for Python
-    from .assessment.camera_memory import CombinedNights as CombinedNights
-    from .assessment.camera_memory import combine_nights as combine_nights
     from .assessment.map_difference import difference as difference
+    from .assessment.nights.camera_memory import CombinedNights as CombinedNights
+    from .assessment.nights.camera_memory import combine_nights as combine_nights
     from .cameras.camera import Camera as Camera
     from .cameras.detector import Detector as Detector
     from .coaddition.mosaic import Mosaic as Mosaic
@@ -47,7 +47,7 @@ __version__: str  # of the package as it is installed, see `__getattr__`
 _PLACES = {
     "Camera": "cameras.camera",
     "Catalogue": "photometry.catalogue",
-    "CombinedNights": "assessment.camera_memory",
+    "CombinedNights": "assessment.nights.camera_memory",
     "Detector": "cameras.detector",
     "EffectivePSF": "measurement.effective.model",
     "Exposure": "inputs.exposures",
@@ -61,7 +61,7 @@ _PLACES = {
     "calibrate_noise": "measurement.noise_calibration",
     "catalogue": "photometry.catalogue",
     "coadd": "coaddition.mosaicking",
-    "combine_nights": "assessment.camera_memory",
+    "combine_nights": "assessment.nights.camera_memory",
     "difference": "assessment.map_difference",
     "effective_psf": "measurement.positions",
     "match": "matching.matcher",

@@ -88,6 +88,8 @@ def known_map(thing, label, other=None):
     if isinstance(thing, Camera):
         return _of_camera(thing, label, other and other.common)
     if not isinstance(thing, Prior):
+        if thing.has_focal_plane:
+            return _of_camera(thing.camera(), label, other and other.common, thing.static(further_night=True)[1])
         return _of_nights(thing, label)
     covariance = _stated(thing)
     named = thing.source.get("detector") if isinstance(thing.source, dict) else None
@@ -109,8 +111,8 @@ def _of_nights(nights, label):
     return KnownMap(nights.name if label.startswith("the ") else label, {"1": static}, {"1": nights.shape}, covariance)
 
 
-def _of_camera(camera, label, common=None):
-    """The detectors of a camera, the shear of whose layouts is a part of their maps.
+def _of_camera(camera, label, common=None, covariance=None):
+    """The detectors of a camera, the shear of whose layouts is a part of their maps; perhaps with a joint covariance.
 
     One that was found from exposures knows nothing of a map that all its detectors share, which these took over, unless
     a reference told it: it is taken as the `common` one (2, n) of what it is compared with.
@@ -124,19 +126,20 @@ def _of_camera(camera, label, common=None):
         plane = Distortion(common[:, :n], camera.field)
         statics = {key: map_alone(each, plane)[1] for key, each in camera.detectors.items()}
     shapes = {key: each.shape for key, each in camera.detectors.items()}
-    widths, covariance = [each.static_sigma for each in camera.detectors.values()], None
+    widths, joint = [each.static_sigma for each in camera.detectors.values()], covariance
     if not camera.has_focal_plane:
         (detector,) = camera.detectors.values()
         covariance = _stated(detector)
     elif any(each is not None for each in widths):
         widths = [widths_alone(each, statics[key].shape[1]) for key, each in camera.detectors.items()]
-        covariance = np.diag(np.concatenate([np.minimum(each.ravel(), NOTHING) ** 2 for each in widths]))
+        alone = np.diag(np.concatenate([np.minimum(each.ravel(), NOTHING) ** 2 for each in widths]))
+        covariance = alone if joint is None else joint
         if n:
             maps = [maps_of_plane(each, camera.field, n).reshape(2, n, -1) for each in camera.detectors.values()]
             whole = [np.pad(each, ((0, 0), (0, max(w.shape[1] - n, 0)), (0, 0)))[:, : w.shape[1]]
                      for each, w in zip(maps, widths, strict=True)]  # fmt: skip
             shared = np.concatenate([each.reshape(-1, 2 * n) for each in whole])
-            covariance += (sigma * shared) @ (sigma * shared).T
+            covariance = covariance + (sigma * shared) @ (sigma * shared).T
     return KnownMap(camera.name if label.startswith("the ") else label, statics, shapes, covariance)
 
 

@@ -25,9 +25,9 @@ from ..results.solution import Solution
 from ..runtime.asdf_files import entry_of
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
-from .camera_memory import CombinedNights
 from .known_maps import DETERMINED, MEAN_SQUARE, chance, known_map
-from .night_data import numbers_in
+from .nights.camera_memory import CombinedNights
+from .nights.night_data import numbers_in
 from .star_difference import StarDifference, compare_stars, shared_exposures
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import legdistort
 
-from ..assessment.night_data import EXACT
+from ..assessment.nights.night_data import EXACT
 from ..coaddition.grids import given_grid, read_grid
 from ..exceptions import InputError, some_of
 from ..inputs import column_contract

@@ -90,7 +90,8 @@ def given_static(where, a):
     dates = sorted({f"{date:.2f}" for date in (nights.dates.min(), nights.dates.max()) if date})
     count = sum(each.n_nights for each in nights.nights)
     what = f"camera {camera.name} ({where}) of {count} night{'s' * (count > 1)}{', ' * bool(dates)}{' to '.join(dates)}"
-    return GivenStatic(camera, what, {"sigma": nights.prior(one_exposure=True).sigma})
+    known = {} if nights.has_focal_plane else {"sigma": nights.prior(one_exposure=True).sigma}
+    return GivenStatic(camera, what, known)
 
 
 def _written(where, entry):

@@ -78,9 +78,10 @@ def warned(repeated):
 def fingerprints(table):
     """Of the positions that were measured in every exposure, ``{exposure: texts}``: those with the smallest hashes.
 
-    So some are the same if other stars of it were matched.
+    So some are the same if other stars of it were matched. Of a camera those on its detectors, wherever these lie.
     """
-    name, x, y = (np.asarray(getattr(table[c], "value", table[c])) for c in ("exposure", "x", "y"))
+    measured = ("x_detector", "y_detector") if "x_detector" in table.colnames else ("x", "y")
+    name, x, y = (np.asarray(getattr(table[c], "value", table[c])) for c in ("exposure", *measured))
     out = {}
     for exposure in dict.fromkeys(name.tolist()):
         mine = name == exposure

@@ -17,7 +17,7 @@ def plot_memory(combined, *, fig=None):
 
     Parameters
     ----------
-    combined : `legdistort.assessment.camera_memory.CombinedNights`
+    combined : `legdistort.assessment.nights.camera_memory.CombinedNights`
     fig : `~matplotlib.figure.Figure`, optional
         Where to draw.
     """

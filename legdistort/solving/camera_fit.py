@@ -85,9 +85,7 @@ class CameraStep:
     @property
     def errors(self):
         """Standard deviations (n_detectors, 2, n_modes) of the changes; zero for what is held."""
-        out = np.zeros(self.free.shape)
-        out[self.free] = np.sqrt(np.diag(self.covariance))
-        return out
+        return errors_of(self.free, self.covariance)
 
     @property
     def length(self):
@@ -247,7 +245,7 @@ class CameraFit:
             warn(f"{words} (of {_STEPS} steps), and errors do not hold: see the check camera", ConvergenceWarning)
         unknown = _unknown(fit.matches.camera, step)
         _tell_unknown(fit.matches, step, unknown)
-        camera = with_errors(fit.matches.camera, step, unknown)
+        camera = with_errors(fit.matches.camera, step.free, step.covariance, unknown)
         camera = replace(camera, common_sigma=common_widths(camera, self.sought), place_errors=None)
         matches = replace(fit.matches, camera=camera)
         unsettled = step.length if step.length >= _SMALL else 0.0
@@ -345,7 +343,7 @@ def _groups(fit):
 
 def _unknown(camera, step):
     """Directions (m, k), of unit rms over the unknowns, that are not determined and no exposure can take over."""
-    exchanged = _exchanged(camera, step.free)
+    exchanged = exchanged_maps(camera, step.free)
     scale = np.abs(step.weak).max(axis=0, initial=0)
     scale = np.maximum(scale, max(_ROUNDED * scale.max(initial=0), np.finfo(float).tiny))
     weak, common = (
@@ -361,7 +359,7 @@ def _unknown(camera, step):
     return out / np.sqrt(np.mean(out**2, axis=1, keepdims=True))
 
 
-def _exchanged(camera, free, degree=None):
+def exchanged_maps(camera, free, degree=None):
     """Changes (m, k) of the free modes of all detectors by common maps of the focal plane, which exposures can undo.
 
     Of a `degree`, or of that of the free modes.
@@ -476,7 +474,7 @@ def camera_step(fit, sought, departure, stated=False):
     normal, pull = _told(fit, follow, free)
     pull = pull - precision * departure[free]
     covariance, weak = _inverse(normal, precision, follow.alone)
-    held = _held(weak, _weights(free, stated), _slides(fit, free, weak))
+    held = held_changes(weak, change_weights(free, stated), _slides(fit, free, weak))
     change = np.zeros(free.shape)
     change[free] = held @ (departure[free] + covariance @ pull) - departure[free]
     covariance = held @ covariance @ held.T
@@ -508,7 +506,7 @@ def _told(fit, follow, free):
     if fit.result.gauge.poses_known or not free[seen][:, :, :3].all():
         return follow.normal, follow.pull
     unit = 1 / np.sqrt(follow.alone)
-    common = np.linalg.qr((_exchanged(camera, free, 1) / unit).T)[0]
+    common = np.linalg.qr((exchanged_maps(camera, free, 1) / unit).T)[0]
     left = np.eye(len(unit)) - common @ common.T
     scaled = left @ (follow.normal * np.outer(unit, unit)) @ left
     return scaled / np.outer(unit, unit), left @ (unit * follow.pull) / unit
@@ -546,7 +544,7 @@ def _slides(fit, free, weak):
     return rows[(left < _LIES_IN * np.linalg.norm(moves, axis=1)) & (len(groups) > 1)]
 
 
-def _weights(free, stated):
+def change_weights(free, stated):
     """Weights (k,) of the free modes: what of them is not determined stays where it was, the more the larger.
 
     Static distortions before layouts, which may be wrong by many pixels, and to shift detectors against one another is
@@ -558,7 +556,7 @@ def _weights(free, stated):
     return np.select([mode == 0, mode < 3], [shift, rest], 1.0)
 
 
-def _held(weak, weights, slides):
+def held_changes(weak, weights, slides):
     """What takes directions (m, k) that are not determined off a change of the camera, (k, k).
 
     Parameters
@@ -592,13 +590,19 @@ def _widened(detector, degree):
     return {"static_sigma": sigma, "static_covariance": resized(detector.static_covariance, basis.n_modes(degree))}
 
 
-def with_errors(camera, step, unknown):
-    """The camera with the errors of a step, infinite along `unknown` directions (m, k) of its free modes.
+def errors_of(free, covariance):
+    """Standard deviations (n_detectors, 2, n_modes) of the free modes, of a covariance (k, k); zero for others."""
+    out = np.zeros(free.shape)
+    out[free] = np.sqrt(np.diag(covariance))
+    return out
+
+
+def with_errors(camera, free, covariance, unknown):
+    """The camera with the errors of its free modes, of a covariance (k, k), infinite along `unknown` directions (m, k).
 
     Detectors of which nothing is free keep theirs.
     """
-    errors, index = step.errors, np.full(step.free.shape, -1)
-    free = step.free
+    errors, index = errors_of(free, covariance), np.full(free.shape, -1)
     errors[free] = np.where(np.any(np.abs(unknown) > errors[free], axis=0), np.inf, errors[free])
     index[free] = np.arange(np.count_nonzero(free))
     detectors = {}
@@ -607,16 +611,16 @@ def with_errors(camera, step, unknown):
         if not free[k].any():
             continue
         low, places = free[k, :, :3].ravel(), index[k, :, :3].ravel()
-        covariance = np.zeros((6, 6))
-        covariance[np.ix_(low, low)] = step.covariance[np.ix_(places[low], places[low])]
+        of_layout = np.zeros((6, 6))
+        of_layout[np.ix_(low, low)] = covariance[np.ix_(places[low], places[low])]
         lost = np.isinf(errors[k, :, :3].ravel())
-        covariance[lost] = covariance[:, lost] = 0.0
-        covariance[lost, lost] = np.inf
+        of_layout[lost] = of_layout[:, lost] = 0.0
+        of_layout[lost, lost] = np.inf
         top = max(basis.degree_of(free.shape[2]), basis.degree_of(each.static.shape[1]))
         widths = basis.change_degree(np.where(np.arange(free.shape[2]) < 3, 0.0, errors[k]), top)
         static = basis.change_degree(each.static, top)
         known = {"static_sigma": widths, "static_covariance": None}
-        detectors[key] = replace(each, layout_covariance=covariance, static=static, **known)
+        detectors[key] = replace(each, layout_covariance=of_layout, static=static, **known)
     return replace(camera, detectors=detectors)
 
 

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rolled_night import modes, night
 
 import legdistort as ld
-from legdistort.assessment.combined_nights import Chain, fitted
+from legdistort.assessment.nights.combined_nights import Chain, fitted
 from legdistort.cli import main
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.geometry import detector_modes

@@ -23,7 +23,7 @@ from numpy.polynomial import polynomial
 from numpy.testing import assert_allclose, assert_array_equal
 from scamp_heads import barrel, matrix, to_plane, to_sky, write_head
 
-from legdistort.assessment.camera_memory import combine_nights
+from legdistort.assessment.nights.camera_memory import combine_nights
 from legdistort.cameras.source import Source
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortError

@@ -7,15 +7,17 @@ from dataclasses import KW_ONLY, dataclass, field
 import numpy as np
 from astropy import units as u
 
-from ..cameras.stated_errors import StaticErrors
-from ..exceptions import AssumptionWarning, InputError, some_of, warn
-from ..geometry import basis, detector_modes
-from ..inputs import column_contract
-from ..inputs.repetitions import fingerprints
-from ..priors.prior import Prior
-from ..results.solution import Solution
-from ..runtime.trees.facts import array, number
-from .known_maps import shown_by, sound
+from ...cameras.camera import Camera
+from ...cameras.stated_errors import StaticErrors
+from ...exceptions import AssumptionWarning, InputError, some_of, warn
+from ...geometry import basis, detector_modes
+from ...inputs import column_contract
+from ...inputs.repetitions import fingerprints
+from ...priors.prior import Prior
+from ...results.solution import Solution
+from ...runtime.trees.facts import array, number
+from ..known_maps import shown_by, sound
+from .camera_changes import shown_of_camera
 
 #: Error of a coefficient [pix] of a map that states none: that of a header as `legdistort attach` writes it.
 EXACT = 1e-3
@@ -37,8 +39,8 @@ class Night:
     date : float or None
         Mean Julian year of its exposures.
     n_exposures, n_stars : int
-    around : ndarray, shape (2, n_modes)
-        Pixels.
+    around : ndarray, shape (2, n_modes), or None
+        Pixels; None of a camera with several detectors.
     information : ndarray, shape (k, k) or (2 k, 2 k)
         Pixels^-2, with slopes beyond the first k.
     pull : ndarray, shape (k,) or (2 k,)
@@ -61,6 +63,9 @@ class Night:
         Their rms deviation from it.
     lowest, highest : float or None
         Of these.
+    camera : Camera or None
+        That of the night, where it has several detectors: z are changes of all their modes from it, of orders 0 and 1
+        the layout (n_detectors, 2, n_modes), and maps of the focal plane that all of them share have no information.
     """
 
     name: str
@@ -68,7 +73,7 @@ class Night:
     date: float | None = field(metadata=number(unit="yr"))
     n_exposures: int
     n_stars: int
-    around: np.ndarray = field(metadata=array(2, "n_modes", unit="pix"))
+    around: np.ndarray | None = field(metadata=array(2, "n_modes", unit="pix"))
     information: np.ndarray = field(metadata=array("n_rows", "n_rows", unit="pix-2"))
     pull: np.ndarray = field(metadata=array("n_rows", unit="pix-1"))
     n_nights: int = field(metadata=number(minimum=1))
@@ -81,16 +86,27 @@ class Night:
     spread: float = field(default=0.0, metadata=number(minimum=0))
     lowest: float | None = None
     highest: float | None = None
+    camera: Camera | None = None
+
+    @property
+    def degree(self) -> int:
+        """Total degree of the distortion."""
+        n = self.around.shape[1] if self.camera is None else len(self.pull) // (2 * len(self.camera.detectors))
+        return basis.degree_of(n)
 
     @classmethod
     def of(cls, solution: Solution, name: str, covariate: str | None = None) -> Night:
         """That of a solution, with slopes by a column of the table of matches, if one is named."""
+        if solution.camera.has_focal_plane and covariate is not None:
+            raise InputError(
+                f"{name} is of camera {solution.camera.name} with several detectors, whose distortions are not sought "
+                "as dependent on a number: leave the covariate out"
+            )
         numbers = None if covariate is None else numbers_in(solution, covariate, name)
-        shown = shown_by(solution, name, numbers=numbers)
-        given = {each: getattr(shown, each) for each in ("around", "information", "pull", "scatter", "nightly", "dof")}
+        given = _shown_by(solution, name, numbers)
         table, nights = solution.residuals[sound(solution)], solution.nights
         counts = {f"n_{each}s": len(np.unique(table[each])) for each in ("exposure", "star")}
-        counts["n_nights"] = 1 if shown.nightly is None else int(np.count_nonzero(~nights["odd"]))
+        counts["n_nights"] = 1 if given["nightly"] is None else int(np.count_nonzero(~nights["odd"]))
         date = float(np.mean(column_contract.values(table, "epoch", u.yr))) if "epoch" in table.colnames else None
         odd = tuple(str(each) for each in nights["name"][nights["odd"]])
         measured, used = fingerprints(solution.residuals), set(table["exposure"])
@@ -124,6 +140,16 @@ class Night:
         )  # fmt: skip
 
 
+def _shown_by(solution, name, numbers):
+    """What the exposures of a solution show, as a `Night` has it."""
+    if not solution.camera.has_focal_plane:
+        shown = shown_by(solution, name, numbers=numbers)
+        return {each: getattr(shown, each) for each in ("around", "information", "pull", "scatter", "nightly", "dof")}
+    information = shown_of_camera(solution, name)
+    given = {"around": None, "information": information, "pull": np.zeros(len(information)), "nightly": None}
+    return given | {"scatter": np.zeros(solution.degree + 1), "dof": np.inf, "camera": solution.camera}
+
+
 def numbers_in(solution, covariate, name):
     """What a column states of every exposure of a solution that counts, ``{exposure: number}``."""
     table = solution.residuals[sound(solution)]
@@ -150,26 +176,28 @@ def numbers_in(solution, covariate, name):
 
 
 def night_of(item, covariate=None):
-    """The night of a labelled solution, map or path, and the shape of its detector."""
+    """The night of a labelled solution, map or path, and the shape of its detector, or of its focal plane."""
     label, thing = item
     if isinstance(thing, Prior):
         if covariate is not None:
             raise InputError(f"{label} is a map, which states no {covariate}: leave it out, or the covariate")
         return Night.of_map(thing, label), thing.shape
     solution = thing if isinstance(thing, Solution) else Solution.read(thing)
-    if solution.camera.has_focal_plane:
-        raise InputError(f"{label} is of camera {solution.camera.name} with several detectors: solve them one by one")
-    shapes = set(solution.estimate.shapes.values())
-    return Night.of(solution, label, covariate), next(iter(shapes))
+    return Night.of(solution, label, covariate), next(iter(solution.estimate.shapes.values()))
 
 
 def check_nights(nights, shapes):
-    """Nights of one detector and degree, no exposure twice."""
-    if len(shapes) > 1:
+    """Nights of the same detectors and of one degree, no exposure twice."""
+    several = {_detectors(each.camera): each.name for each in reversed(nights) if each.camera is not None}
+    if len(several) > 1 or (len(several) == 1 and any(each.camera is None for each in nights)):
+        one = next((each.name for each in nights if each.camera is None), None)
+        words = [f"{name} (detectors {each})" for each, name in several.items()] + [f"{one} (one detector)"] * bool(one)
+        raise InputError(f"nights are of several cameras, {', '.join(words)}: combine those of one")
+    if not several and len(shapes) > 1:
         raise InputError(f"nights are of detectors of several shapes, {sorted(shapes)} (ny, nx): combine those of one")
     degrees = {}
     for each in nights:
-        degrees.setdefault(basis.degree_of(each.around.shape[1]), each.name)
+        degrees.setdefault(each.degree, each.name)
     if len(degrees) > 1:
         words = ", ".join(f"{degree} ({name})" for degree, name in sorted(degrees.items()))
         raise InputError(f"nights were solved with several degrees, {words}: solve all with one (--degree)")
@@ -181,6 +209,11 @@ def check_nights(nights, shapes):
                     f"{night.name} has an exposure that {seen[position]} has too: give every exposure once"
                 )
         seen |= dict.fromkeys(night.exposures, night.name)
+
+
+def _detectors(camera):
+    """Detectors of a camera by their sizes, in words."""
+    return ", ".join(f"{key} of {each.shape[1]} x {each.shape[0]}" for key, each in sorted(camera.detectors.items()))
 
 
 def check_numbers(nights, covariate):
@@ -209,13 +242,13 @@ def standard_numbers(nights):
     return mean, unit, (number - mean) / unit
 
 
-def given_by(nights, rows, unit):
-    """What nights see, as `legdistort.assessment.combined_nights.fitted` takes it, with slopes by a unit."""
+def given_by(nights, modes, unit):
+    """What nights see, as `legdistort.assessment.nights.combined_nights.fitted` takes it, with slopes by a unit."""
     out = []
     for each in nights:
-        around, k = rows @ each.around.ravel(), len(rows)
-        scale = np.repeat([1.0, 1 / unit], k)[: len(each.pull)]
-        out.append((around, scale[:, None] * each.information * scale, scale * each.pull))
+        around, information, pull = modes.seen(each)
+        scale = np.repeat([1.0, 1 / unit], modes.size)[: len(pull)]
+        out.append((around, scale[:, None] * information * scale, scale * pull))
     return out
 
 

@@ -14,33 +14,34 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 
-from ..cameras import storage as camera_files
-from ..cameras.camera import Camera
-from ..cameras.detector import Detector
-from ..cameras.stated_errors import FREE, UNKNOWN
-from ..exceptions import AssumptionWarning, InputError, some_of, warn
-from ..geometry import basis, detector_modes, epochs
-from ..inputs.table_files import records
-from ..plots.memory_plots import plot_memory
-from ..priors.mode_tables import mode_table
-from ..priors.prior import Prior
-from ..results.solution import Solution
-from ..runtime import asdf_files, provenance
-from ..runtime.guards.units import plain_numbers
-from ..runtime.notebook import ShownAsPrinted
-from ..runtime.outputs import replacing
-from ..runtime.parallel import map_items
-from ..runtime.trees import codec
-from ..runtime.trees.facts import SIZE, array, number
+from ...cameras import storage as camera_files
+from ...cameras.camera import Camera
+from ...cameras.detector import Detector
+from ...cameras.stated_errors import FREE, UNKNOWN
+from ...exceptions import AssumptionWarning, InputError, some_of, warn
+from ...geometry import basis, epochs
+from ...inputs.table_files import records
+from ...plots.memory_plots import plot_memory
+from ...priors.mode_tables import mode_table
+from ...priors.prior import Prior
+from ...results.solution import Solution
+from ...runtime import asdf_files, provenance
+from ...runtime.guards.units import plain_numbers
+from ...runtime.notebook import ShownAsPrinted
+from ...runtime.outputs import replacing
+from ...runtime.parallel import map_items
+from ...runtime.trees import codec
+from ...runtime.trees.facts import SIZE, array, number
+from ..known_maps import DETERMINED, KEPT, MEAN_SQUARE, chance
+from .camera_changes import modes_of
 from .combined_nights import Chain, contradiction, fitted, own_scatter2
-from .known_maps import DETERMINED, KEPT, MEAN_SQUARE, chance
 from .night_data import EXACT, Night, check_nights, check_numbers, dates_of, given_by, night_of, standard_numbers
 
 if TYPE_CHECKING:
     from astropy.time import Time
     from matplotlib.figure import Figure
 
-    from ..runtime.annotations import StrPath
+    from ...runtime.annotations import StrPath
 
 #: Version of the layout under ``legdistort_nights``, and that entry of a file.
 LAYOUT, ROOT = 1, "legdistort_nights"
@@ -51,7 +52,10 @@ _WEAK = 10  # errors of a combination in those of most, from which it is told ap
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CombinedNights(ShownAsPrinted):
-    """The static distortion of one detector from many nights, made by `legdistort.combine_nights`.
+    """The static distortion of a camera from many nights, made by `legdistort.combine_nights`.
+
+    Of several detectors (`has_focal_plane`) S are changes of the modes of all of them, of orders 0 and 1 the layout,
+    from the camera of the first night; maps of the focal plane that all detectors share are no part of it.
 
     Night n sees ``S(t_n) + B_n``. S is constant; where the nights show that it changes, it has a rate and a random walk
     in time, or depends linearly on a number of the exposures, the covariate. B_n is what the exposures of a night have
@@ -62,11 +66,12 @@ class CombinedNights(ShownAsPrinted):
     nights : tuple of Night
         By date.
     shape : tuple
-        ``(ny, nx)`` of the detector.
+        ``(ny, nx)`` of the detector, or of the focal plane.
     name : str
         Of the camera.
     scatter : ndarray, shape (degree,)
-        Of B by degree, pixels a normalised coefficient; zero where a single night does not tell it.
+        Of B by degree, pixels a normalised coefficient; zero where a single night does not tell it. Of several
+        detectors from degree 0 on, (degree + 1,).
     oddness : ndarray, shape (n_nights,)
         Factors >= 1 on it, as for Student's t distribution: odd nights count less.
     rate, walk : float
@@ -106,7 +111,16 @@ class CombinedNights(ShownAsPrinted):
     @property
     def degree(self) -> int:
         """Total degree of the distortion."""
-        return basis.degree_of(self.nights[0].around.shape[1])
+        return self.nights[0].degree
+
+    @property
+    def has_focal_plane(self) -> bool:
+        """Whether the camera has several detectors, in a focal plane."""
+        return self.nights[0].camera is not None
+
+    def _check_single(self, cure):
+        if self.has_focal_plane:
+            raise InputError(f"camera {self.name} has several detectors, and no single distortion: {cure}")
 
     def _year(self, date):
         return float(self.dates.max() if date is None else epochs.year(date))
@@ -131,20 +145,19 @@ class CombinedNights(ShownAsPrinted):
         return float((value - mean) / unit)
 
     @cached_property
-    def _rows(self):
-        return detector_modes.dynamic_basis(self.shape, basis.n_modes(self.degree))
+    def _modes(self):
+        return modes_of(self.nights, self.shape)
 
     @cached_property
     def _widths(self):
-        """Scatter of nights, of every row."""
-        return self.scatter[detector_modes.dynamic_degrees(basis.n_modes(self.degree)) - 1]
+        """Scatter of nights, of every mode."""
+        return self.scatter[self._modes.labels - 1]
 
     @cached_property
     def _chain(self):
         _, unit, numbers = self._standard
-        given = given_by(self.nights, self._rows, unit)
-        degrees = detector_modes.dynamic_degrees(basis.n_modes(self.degree))
-        scatter2 = own_scatter2(self.scatter, self.oddness, self._whole, degrees)
+        given = given_by(self.nights, self._modes, unit)
+        scatter2 = own_scatter2(self.scatter, self.oddness, self._whole, self._modes.labels)
         sizes = {"rate": self.rate, "walk": self.walk, "slope": self.slope * unit}
         return Chain.of(given, scatter2, self.dates, sizes, numbers)
 
@@ -155,11 +168,13 @@ class CombinedNights(ShownAsPrinted):
 
     def _known(self, date=None, value=None):
         """S at a date and a value (K,) and its covariance, free along what nights do not tell."""
-        k = len(self._rows)
+        k = self._modes.size
         mean, covariance = self._chain.at(self._year(date), self._number(value))
         mean, covariance = mean[:k], covariance[:k, :k]
         # what a map states counts however wide it is
-        whole = sum(each.information[:k, :k] * (1 if each.n_stars else DETERMINED * UNKNOWN**2) for each in self.nights)
+        seen = [information[:k, :k] for _, information, _ in given_by(self.nights, self._modes, 1.0)]
+        factors = [1 if each.n_stars else DETERMINED * UNKNOWN**2 for each in self.nights]
+        whole = sum(factor * each for factor, each in zip(factors, seen, strict=True))
         power, directions = np.linalg.eigh(whole)
         told, free = directions[:, power > DETERMINED], directions[:, power <= DETERMINED]
         if free.shape[1]:
@@ -175,6 +190,9 @@ class CombinedNights(ShownAsPrinted):
     ) -> tuple[np.ndarray, np.ndarray]:
         """S at a date and value, normalised Legendre modes (2, n_modes), and its covariance (2 n_modes,) * 2, pixels.
 
+        Of several detectors changes (n_detectors, 2, n_modes) from the camera of the first night, and the covariance of
+        all, one detector after the other.
+
         Combinations that nights together do not determine, to 0.3 px rms per axis over the detector, are zero in it,
         with an error of 1000 px: what little they say of them rests on maps being polynomials exactly.
 
@@ -188,8 +206,7 @@ class CombinedNights(ShownAsPrinted):
             Whether the covariance is that of a further night, with the scatter of nights.
         """
         mean, covariance = self._known(date, value)
-        covariance = covariance + np.diag(self._widths**2) * further_night
-        return (self._rows.T @ mean).reshape(2, -1), self._rows.T @ covariance @ self._rows
+        return self._modes.coefficients(mean, covariance + np.diag(self._widths**2) * further_night)
 
     @property
     def slopes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -197,10 +214,10 @@ class CombinedNights(ShownAsPrinted):
 
         Zero where no dependence is seen. Where nights do not tell, the error is ten times `slope`.
         """
-        k, unit = len(self._rows), self._standard[1]
+        k, unit = self._modes.size, self._standard[1]
         mean, covariance = self._chain.at(self._year(None)) if self.slope else (np.zeros(2 * k), np.zeros((2 * k,) * 2))
         mean, covariance = mean[k:] / unit, covariance[k:, k:] / unit**2
-        return (self._rows.T @ mean).reshape(2, -1), self._rows.T @ covariance @ self._rows
+        return self._modes.coefficients(mean, covariance)
 
     @plain_numbers
     def prior(
@@ -217,7 +234,13 @@ class CombinedNights(ShownAsPrinted):
         one_exposure : bool
             Whether it is for one exposure alone, which does not tell how far exposures scatter: as far as those of
             the nights, `exposure_scatter`, is the `sigma` of the prior then.
+
+        Raises
+        ------
+        InputError
+            Of a camera with several detectors.
         """
+        self._check_single("take its camera, camera() (--camera)")
         static, covariance = self.static(date, value, further_night=True)
         record = {"kind": "nights", "name": self.name, "nights": len(self.nights)}
         known = Prior(static, static_covariance=covariance, shape=self.shape, source=record)
@@ -228,7 +251,7 @@ class CombinedNights(ShownAsPrinted):
 
     @plain_numbers
     def camera(self, date: float | Time | None = None, value: float | None = None) -> Camera:
-        """The same as a `Camera` of one detector.
+        """The same as a `Camera`: of one detector, or of several, whose layouts and static distortions have errors.
 
         Parameters
         ----------
@@ -236,13 +259,18 @@ class CombinedNights(ShownAsPrinted):
         value : float, optional
             As for `prior`.
         """
+        if self.has_focal_plane:
+            return self._camera(date, further_night=True)
         return Camera(self.name, {"1": Detector(self.shape, static=self.prior(date, value))})
+
+    def _camera(self, date, *, further_night):
+        return self._modes.changed(self.name, *self.static(date, further_night=further_night))
 
     @plain_numbers
     def modes(self, date: float | Time | None = None, value: float | None = None) -> QTable:
         """One row a mode and axis: ``axis``, ``x_degree``, ``y_degree``, ``coefficient``, ``error``, ``night_scatter``,
         pixels; shift, rotation and scale are taken off. Where the map depends on a covariate ``slope``, ``slope_error``
-        too, pixels a unit of it.
+        too, pixels a unit of it. Of several detectors those of degree 2 and more, with a column ``detector``.
 
         Parameters
         ----------
@@ -250,9 +278,11 @@ class CombinedNights(ShownAsPrinted):
         value : float, optional
             As for `static`.
         """  # fmt: skip
+        if self.has_focal_plane:
+            return self._modes.table(self._camera(date, further_night=False), self._widths)
         static, covariance = self.static(date, value)
         error = np.sqrt(np.diag(covariance)).reshape(2, -1)
-        scatter = np.sqrt(self._widths**2 @ self._rows**2).reshape(2, -1)
+        scatter = np.sqrt(self._widths**2 @ self._modes.rows**2).reshape(2, -1)
         known = np.where(error < UNKNOWN, error, np.nan)
         out = mode_table(coefficient=static, error=known, night_scatter=scatter)
         if self.slope:
@@ -274,7 +304,7 @@ class CombinedNights(ShownAsPrinted):
             own = self._widths * (night.n_nights == 1)
             chi2, dof, away = contradiction(self._chain, n, own) if count > 1 else (0.0, 0, np.zeros(1))
             p = chance(chi2, dof, night.dof)
-            rms = np.sqrt(np.sum(away**2) / MEAN_SQUARE)
+            rms = np.sqrt(np.sum(away**2) / MEAN_SQUARE / self._modes.n_detectors)
             date = np.nan if night.date is None else night.date
             counts = night.n_nights, night.n_exposures, night.n_stars
             value = np.nan if night.value is None else night.value
@@ -303,13 +333,14 @@ class CombinedNights(ShownAsPrinted):
         The error holds the scatter of nights; it is large where the night does not tell. Where the map depends on a
         covariate the night is brought to the mean of that, by the slopes of all nights.
         """
-        k, chain, scatter2 = len(self._rows), self._chain, self._widths**2 * (self.nights[n].n_nights == 1)
+        k, chain, scatter2 = self._modes.size, self._chain, self._widths**2 * (self.nights[n].n_nights == 1)
         whole = np.linalg.inv(chain.information[n][:k, :k] + np.eye(k) / UNKNOWN**2)
-        mean, covariance = whole @ chain.pull[n][:k], self._rows.T @ (whole + np.diag(scatter2)) @ self._rows
+        mean, covariance = whole @ chain.pull[n][:k], whole + np.diag(scatter2)
         if self.slope:
             slopes = chain.at(self._year(None))[0][k:]
             mean = mean - whole @ chain.information[n][:k, k:] @ slopes - chain.numbers[n] * slopes
-        return (self._rows.T @ mean).reshape(2, -1), np.sqrt(np.diag(covariance)).reshape(2, -1)
+        values, covariance = self._modes.coefficients(mean, covariance)
+        return values, np.sqrt(np.diag(covariance)).reshape(values.shape)
 
     @property
     def dates(self) -> np.ndarray:
@@ -320,7 +351,7 @@ class CombinedNights(ShownAsPrinted):
     def exposure_scatter(self) -> np.ndarray:
         """Of single exposures about their night by degree, pixels a normalised coefficient: (degree,), of all nights.
 
-        Zero for maps.
+        Zero for maps, and of several detectors, of which it is not found.
         """
         weight = np.array([each.n_exposures * bool(np.any(each.scatter)) for each in self.nights], dtype=float)
         squares = np.array([each.scatter**2 for each in self.nights])
@@ -356,7 +387,8 @@ class CombinedNights(ShownAsPrinted):
         return named | sizes | {"modes": records(self.modes(date, value)), "nights": records(self.table)}
 
     def plot(self, *, fig: Figure | None = None) -> Figure:
-        """Coefficients against time, see `legdistort.plots.memory_plots.plot_memory`."""
+        """Coefficients of one detector against time, see `legdistort.plots.memory_plots.plot_memory`."""
+        self._check_single("its coefficients are not drawn (leave --plot out), a picture of it is camera().plot()")
         return plot_memory(self, fig=fig)
 
     @plain_numbers
@@ -401,7 +433,8 @@ class CombinedNights(ShownAsPrinted):
 
     def _said_of_weak(self):
         """Combinations whose errors are far larger than those of most, which single coefficients do not show."""
-        error = np.sqrt(np.linalg.eigvalsh(self._known()[1]))
+        told = self._modes.told
+        error = np.sqrt(np.linalg.eigvalsh(told @ self._known()[1] @ told.T))
         weak = error > _WEAK * np.median(error)
         if not weak.any():
             return []
@@ -440,7 +473,7 @@ class CombinedNights(ShownAsPrinted):
         if not self.scatter.any():
             lines.append("One night does not tell how far nights scatter: errors are those of this night alone.")
         else:
-            scatter = ", ".join(f"{each:.2g} (degree {d})" for d, each in enumerate(self.scatter, 1))
+            scatter = ", ".join(f"{each:.2g} (degree {d})" for d, each in enumerate(self.scatter, self._modes.lowest))
             lines.append(f"Nights scatter by {scatter} px a coefficient.")
             drift = f"{self.rate:.2g} px a year, and wanders by {self.walk:.2g} px in the root of a year"
             if self.drifts or len(self.nights) > 2:
@@ -450,7 +483,10 @@ class CombinedNights(ShownAsPrinted):
             scatter = ", ".join(f"{each:.2g} (degree {d})" for d, each in enumerate(own, 1))
             lines.append(f"Exposures scatter about their night by {scatter} px a coefficient.")
         lines += [*self._said_of_odd(), ""]
-        lines.append("Normalised Legendre modes, undistorted to detector pixels, shift, rotation and scale taken off:")
+        if self.has_focal_plane:
+            lines += [*self._camera(None, further_night=False).table_lines(), ""]
+        off = "those of degree 2 and more" if self.has_focal_plane else "shift, rotation and scale taken off"
+        lines.append(f"Normalised Legendre modes, undistorted to detector pixels, {off}:")
         lines += [*self.modes().pformat(max_lines=-1, max_width=-1), *self._said_of_weak()]
         shown = self.table[[name for name in self.table.colnames if name != "odd"]]
         forms = {"date": ".3f", "departure": ".4f", "chi2": ".1f", "p": ".2g", "oddness": ".2f", "value": ".6g"}
@@ -468,7 +504,7 @@ def combine_nights(
     workers: int | None = None,
     progress: bool = False,
 ) -> CombinedNights:
-    """Combine nights to one static distortion of the camera, with what each night adds found from all.
+    """Combine nights to one camera, its static distortion and layout, with what each night adds found from all.
 
     Of every night counts what its exposures tell of the static distortion by dithers and rolls, whatever prior it was
     solved with, so that a prior counts nowhere. What a night does not determine it does not state. A map of another
@@ -497,8 +533,9 @@ def combine_nights(
     Raises
     ------
     InputError
-        Naming the night: of another detector or degree, of a camera of several detectors, with exposures that were
-        given before, or without the covariate. If that is one number everywhere.
+        Naming the night: of another detector or degree, with exposures that were given before, or without the
+        covariate; of several detectors if layout and static distortion were not both fitted with nothing known
+        beforehand, or with a covariate. If that is one number everywhere.
 
     Warns
     -----
@@ -583,8 +620,7 @@ def _opened(thing):
 
 def _combined(nights, shape, name, covariate):
     nights = sorted(nights, key=lambda night: np.inf if night.date is None else night.date)
-    n = nights[0].around.shape[1]
-    rows, degrees = detector_modes.dynamic_basis(shape, n), detector_modes.dynamic_degrees(n)
+    modes = modes_of(nights, shape)
     _, unit, numbers = standard_numbers(nights) if covariate else (0.0, 1.0, None)
     whole = [each for each in nights if each.n_nights > 1]
     known = None
@@ -592,8 +628,8 @@ def _combined(nights, shape, name, covariate):
         weight = [each.n_nights for each in whole]
         known = np.sqrt(np.average([each.nightly**2 for each in whole], axis=0, weights=weight))
     together = np.array([each.n_nights > 1 for each in nights])
-    given = given_by(nights, rows, unit)
-    chain, oddness, scatter, evidence = fitted(given, dates_of(nights), degrees, together, known, numbers)
+    given = given_by(nights, modes, unit)
+    chain, oddness, scatter, evidence = fitted(given, dates_of(nights), modes.labels, together, known, numbers)
     changes = {"rate": chain.rate, "walk": chain.walk, "slope": float(chain.slope / unit)}
     changes |= {"covariate": covariate, "evidence": evidence}
     return CombinedNights(tuple(nights), shape=shape, name=name, scatter=scatter, oddness=oddness, **changes)

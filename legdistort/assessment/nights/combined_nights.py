@@ -6,18 +6,19 @@ from functools import cached_property
 import numpy as np
 from scipy import linalg, sparse
 
-from ..cameras.stated_errors import FREE
-from ..solving.gauge.dynamic_scatter import CHANCE, TAILS
-from ..solving.knowledge.exposures import RANGE
-from ..solving.knowledge.factors import GIVEN, Factor
-from ..solving.knowledge.posterior import most_likely
-from ..solving.knowledge.reduced_data import ReducedData, drawn
-from .known_maps import DETERMINED, KEPT
+from ...cameras.stated_errors import FREE
+from ...solving.gauge.dynamic_scatter import CHANCE, TAILS
+from ...solving.knowledge.exposures import RANGE
+from ...solving.knowledge.factors import GIVEN, Factor
+from ...solving.knowledge.posterior import most_likely
+from ...solving.knowledge.reduced_data import ReducedData, drawn
+from ..known_maps import DETERMINED, KEPT
 
 _EXACT = 1e-6  # scatter of one night, of which nothing tells [pix]
 _MOST, _FEWEST = 600, 12  # unknowns from which sizes are found, and nights, if there are as many
 _ROUNDS, _SETTLED = 20, 0.02
 _TINY = 1e-3  # of the scatter of nights, which is as good as none
+_ROUNDING = 1e-13  # of the largest information
 _WIDE = 10  # sizes of slopes that these may have: one that stands out is not drawn to the others, which are none
 
 
@@ -280,17 +281,21 @@ def _model(nights, dates, degrees, numbers, drifts):
         information = np.block([[information, across], [across.T, own]])
         pull = np.append(pull, sum(each[2][k:] for each in nights))
     data = ReducedData(information, pull, 0.0, n * k)
+    known, vectors = np.linalg.eigh(sum(each[1] for each in apart) / n)
+    untold = vectors[:, known < _ROUNDING * known.max(initial=0)].T
+    known = known[known > DETERMINED]
+    unit = 1 / np.sqrt(np.median(known)) if len(known) else 0.1
     counts = {"night": n, "slope": slopes, "static": m, "rate": drifts}
 
-    def add(value, size, stretch, **rows):
+    def add(value, size, stretch, each=eye, width=FREE, **rows):
         of = [name for name, count in counts.items() if count]
-        blocks = [sparse.kron(rows[name], eye) if name in rows else None for name in of]
+        blocks = [sparse.kron(rows[name], each) if name in rows else None for name in of]
         blocks = [
             sparse.csr_array((len(value), k * count)) if block is None else block
             for block, count in zip(blocks, map(counts.get, of), strict=True)
         ]
         all_rows = sparse.hstack(blocks, format="csr")
-        parts.append(Factor("nights", all_rows, value, np.full(len(value), FREE), size, stretch))
+        parts.append(Factor("nights", all_rows, value, np.full(len(value), width), size, stretch))
 
     own = sparse.csr_array((-np.ones(n), (range(n), place)), (n, m))
     away = np.concatenate([each[0] - nights[0][0] for each in nights])
@@ -298,6 +303,8 @@ def _model(nights, dates, degrees, numbers, drifts):
     more |= {"slope": -numbers[:, None]} if slopes else {}
     add(away, np.tile(degrees - 1, n), np.ones(n * k), night=np.eye(n), static=own, **more)
     add(np.zeros(k), np.full(k, GIVEN), np.ones(k), static=np.eye(1, m))
+    # what no night tells is nowhere in the likelihood: held, so that the rest is not lost beside it
+    add(np.zeros(len(untold)), np.full(len(untold), GIVEN), np.ones(len(untold)), untold, unit, static=np.eye(1, m))
     first = int(degrees.max())
     if slopes:
         add(np.zeros(k), np.full(k, first + 2 * drifts), np.ones(k), slope=np.eye(1))
@@ -305,9 +312,7 @@ def _model(nights, dates, degrees, numbers, drifts):
         add(np.zeros(k), np.full(k, first), np.ones(k), rate=np.eye(1))
         steps, since = np.eye(m - 1, m, k=1) - np.eye(m - 1, m), np.repeat(np.sqrt(np.diff(times)), k)
         add(np.zeros((m - 1) * k), np.full((m - 1) * k, first + 1), since, static=steps)
-    known = np.linalg.eigvalsh(sum(each[1] for each in apart) / n)
-    known = known[known > DETERMINED]
-    return data, Factor.joined(parts), 1 / np.sqrt(np.median(known)) if len(known) else 0.1
+    return data, Factor.joined(parts), unit
 
 
 def contradiction(chain, n, width):

@@ -1,0 +1,1 @@
+"""Nights of a camera, added to one."""
