@@ -122,7 +122,7 @@ def assemble(layers, recipe, folder, share):
     small, context = n_bytes(recipe.shape, len(layers)) <= _IN_MEMORY, (n_planes(len(layers)), *recipe.shape)
     empty = np.full if small else partial(spill, folder=folder)
     planes = [empty(recipe.shape, value, np.float32) for value in (np.nan, np.nan, 0)]
-    planes += [empty(recipe.shape, 0, dtype) for dtype in (np.int32, np.uint8)]
+    planes += [empty(recipe.shape, 0, dtype) for dtype in (_count_type(len(layers)), np.uint8)]
     planes += [empty(context, 0, np.uint32), *(empty(recipe.shape, 0, np.uint8) for _ in range(2))]
     pieces = list(blocks(layers, recipe))
     work = partial(stack, recipe=recipe, n_exposures=len(layers))
@@ -137,7 +137,12 @@ def assemble(layers, recipe, folder, share):
 
 def n_bytes(shape, n_exposures):
     """Of the planes of a mosaic."""
-    return int(np.prod(shape)) * (4 * 4 + 3 + 4 * n_planes(n_exposures))
+    return int(np.prod(shape)) * (3 * 4 + _count_type(n_exposures)().nbytes + 3 + 4 * n_planes(n_exposures))
+
+
+def _count_type(n_exposures):
+    """Integers that count so many exposures."""
+    return np.int16 if n_exposures <= np.iinfo(np.int16).max else np.int32
 
 
 def side(n_exposures):

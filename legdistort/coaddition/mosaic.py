@@ -55,7 +55,7 @@ class Mosaic(ShownAsPrinted):
         at order 3, 2.2 times at order 1).
     weight : ndarray of float32, shape (ny, nx)
         Sum of the weights of the exposures that contribute.
-    footprint : ndarray of int32, shape (ny, nx)
+    footprint : ndarray of int, shape (ny, nx)
         Number of exposures that contribute to each pixel.
     flags : ndarray of uint8, shape (ny, nx)
         Bits: 1 = the distortion of an exposure that contributes is extrapolated, 2 = saturated in all exposures and
