@@ -200,14 +200,14 @@ def test_packed_fits_files(mosaic, tmp_path, name, unpack):
     assert names(tmp_path) == [name]
     with fits.open(BytesIO(unpack.decompress((tmp_path / name).read_bytes()))) as hdulist:
         np.testing.assert_array_equal(hdulist["SCI"].data, mosaic.data)
-        assert len(hdulist) == 7
+        assert len(hdulist) == 4
 
 
 @pytest.mark.parametrize("name", ["m.asdf", "M.ASDF"])
 def test_asdf_files(mosaic, tmp_path, name):
     mosaic.write(tmp_path / name)
     with asdf.open(tmp_path / name) as file:
-        np.testing.assert_array_equal(file["mosaic"]["context"], mosaic.context)
+        np.testing.assert_array_equal(file["mosaic"]["footprint"], mosaic.footprint)
 
 
 @pytest.mark.parametrize(
