@@ -22,7 +22,7 @@ from .coaddition.mosaicking import coadd
 from .coaddition.options import CoaddOptions
 from .exceptions import AssumptionWarning, InputError, LegdistortError, warn
 from .inputs import exposure_files, table_files
-from .inputs.exposure_names import whole_name
+from .inputs.exposure_names import left_out_by, whole_name
 from .inputs.exposures import observed, stated_numbers
 from .inputs.frames.statement import stated_rows
 from .inputs.references.gaia import is_gaia
@@ -119,6 +119,7 @@ def run(
     prior: Prior | Mapping[str, Prior] | str | HeaderPrior | None = None,
     camera: Camera | None = None,
     min_exposures: int = 4,
+    without: str | Sequence[str] = (),
     clip: float | None = CLIP,
     psf: Any = "auto",
     reference: Table | SkyCoord | Solution | StrPath | None = None,
@@ -169,6 +170,8 @@ def run(
         to begin with, and found with the rest.
     min_exposures : int
         Stars seen in fewer exposures are not used.
+    without : str or sequence of str
+        Exposures to leave out, by name; ``*`` stands for any letters.
     clip : float or None
         Leave out observations beyond this many standard errors, see `legdistort.solve`.
     psf : str, EffectivePSF, path, photutils model or dict of those
@@ -244,7 +247,7 @@ def run(
     with outputs.replacing_folder(out := Path(out), results=RESULTS, keep=keep) as target:
         check_results(out, overwrite)  # again: nobody else writes there any more
         with timed(timings, "read"):
-            exposures, bad = _open_frames(paths, before, min_exposures, stop_at_bad, progress, reference, **reading)
+            exposures, bad = _opened(paths, before, without, min_exposures, stop_at_bad, progress, reference, **reading)
             solving = _known_of(exposures, solving, prior, reading["camera"])
             stated_numbers({whole_name(e): e.header for e in exposures}, matching.keywords)  # refuses what none states
         with timed(timings, "measure"):
@@ -342,13 +345,15 @@ def _of_start():
     return {} if since is None else {"start": time.perf_counter() - since}
 
 
-def _open_frames(paths, before, min_exposures, stop_at_bad, progress, reference, *, camera, **reading):
-    """Exposures that can be solved together, called as `before`, and the bad ones as ``{name: reason}``."""
+def _opened(paths, before, without, min_exposures, stop_at_bad, progress, reference, *, camera, **reading):
+    """Exposures that can be solved together, called as `before`, and the others as ``{name: reason}``."""
     bad = {}
     options = {"left_out": bad, "stop_at_bad": stop_at_bad, "progress": progress}
     exposures = exposure_files.open_exposures(paths, **options, **reading)
     exposures = camera.of_detectors(exposures) if camera else exposures
     exposures = before.named(exposures) if before else exposures
+    asked = left_out_by(without, list(dict.fromkeys(map(whole_name, exposures))))
+    exposures, bad = [each for each in exposures if whole_name(each) not in asked], bad | asked
     _check_exposures(exposures, min_exposures, bad, reference is not None)
     return exposures, bad
 

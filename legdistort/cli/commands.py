@@ -88,7 +88,7 @@ def do_run(a):
     own = ("psf", "degree", "prior", "clip", "min_exposures", "reference", "pixel_scale", *_TYING)
     with pipeline.called_by(a.begun, repeatable(a)):
         result = legdistort.run(
-            **given(a, options.RUN_FRAMES, options.FLAGGED, options.STOPPING),
+            **given(a, options.RUN_FRAMES, options.FLAGGED, options.STOPPING, options.LEFT_OUT),
             out=a.out,
             **{name: group.pop(name) for group in (measuring, matching, solving) for name in own if name in group},
             measuring=measuring,

@@ -3,21 +3,20 @@
 import re
 from contextlib import contextmanager
 from dataclasses import replace
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import legdistort
 
 from ..assessment.nights.night_data import EXACT
 from ..coaddition.grids import given_grid, read_grid
-from ..exceptions import InputError, some_of
+from ..exceptions import InputError
 from ..inputs import column_contract
+from ..inputs.exposure_names import left_out_by
 from ..inputs.table_files import read_table
 from ..priors.from_files import no_map
 from ..priors.prior import HEADER
 from ..priors.storage import open_prior
 from ..runtime.asdf_files import entry_of
-from ..solving.checks.limits import ASKED
 from .arguments import given
 from .options import EXPANDING
 
@@ -60,7 +59,9 @@ def read_matches(a):
         raise InputError("a table stands twice on the command line: every field has one of its own")
     read = {path: _read(path, a) for path in paths}
     inputs = {name: checksum for _, files in read.values() for name, checksum in files.items()}
-    return _without(_joined(read), a.without), inputs
+    matches = _joined(read)
+    reasons = left_out_by(a.without, matches.names, matches.nights)
+    return matches.without(reasons) if reasons else matches, inputs
 
 
 def _joined(read):
@@ -74,22 +75,6 @@ def _joined(read):
         raise InputError(f"tables of fields must differ in their names, or those of their folders: {', '.join(stems)}")
     fields = {label: matches for label, (matches, _) in zip(labels, read.values(), strict=True)}
     return legdistort.Matches.of_fields(fields)
-
-
-def _without(matches, patterns):
-    """The matches without the exposures, or nights, that were asked to be left out."""
-    reasons = {}
-    for pattern in patterns or ():
-        found = _like(pattern, matches.names) or _like(pattern, matches.nights)
-        if not found:
-            nights = f", and none of the nights: {some_of(list(matches.nights), 6)}" * (len(matches.nights) > 1)
-            raise InputError(f"--without {pattern} is none of the exposures: {some_of(list(matches.names), 6)}{nights}")
-        reasons |= dict.fromkeys(found, ASKED)
-    return matches.without(reasons) if reasons else matches
-
-
-def _like(pattern, names):
-    return [name for name in names if fnmatchcase(str(name), pattern)]
 
 
 @contextmanager

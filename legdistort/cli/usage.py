@@ -42,6 +42,7 @@ COMMANDS = {
         options.CAMERA,
         options.MEASURING,
         options.MATCHING,
+        options.LEFT_OUT,
         options.SOLVING,
         options.COADDING,
         options.WORKERS,

@@ -3,14 +3,17 @@
 import os
 import re
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 
-from ..exceptions import InputError
+from ..exceptions import InputError, some_of
 
 _SUFFIX = re.compile(r"\.(fits|fit|fts|ldac|asdf)(\.(gz|fz|bz2|zip))?$", re.IGNORECASE)
 #: What no name has: slashes, control characters and line breaks, bytes of a file name that are no UTF-8.
 _UNFIT = re.compile("[/\\\\\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 _PRODUCT = re.compile(r"_[A-Za-z]{3,}$")
+#: Why an exposure was left out that the user wanted to be.
+ASKED = "as asked (--without)"
 _LONGEST = 250  # bytes; with the ending .asdf the 255 that file systems allow
 
 
@@ -115,3 +118,21 @@ def check_exposure_name(name, origin=None):
             f"{where}exposure {name!r} cannot be the name of a file; rename it (no slashes, line breaks or control "
             f"characters, at most {_LONGEST} bytes, not empty)"
         )
+
+
+def left_out_by(patterns, names, nights=()):
+    """``{name: why}`` of the exposures, or nights, of these patterns (`fnmatch`), as `Matches.without` takes them.
+
+    Raises
+    ------
+    InputError
+        For a pattern that fits none.
+    """
+    reasons = {}
+    for pattern in [patterns] if isinstance(patterns, str) else patterns or ():
+        found = [[each for each in some if fnmatchcase(str(each), pattern)] for some in (names, nights)]
+        if not any(found):
+            known = f", and none of the nights: {some_of(list(nights), 6)}" * (len(nights) > 1)
+            raise InputError(f"--without {pattern} is none of the exposures: {some_of(list(names), 6)}{known}")
+        reasons |= dict.fromkeys(found[0] or found[1], ASKED)
+    return reasons

@@ -48,7 +48,3 @@ def as_one(checks):
         cure="; ".join(dict.fromkeys(check.cure for check in told if check.cure)),
         tests=tuple(test for check in checks for test in check.tests),
     )
-
-
-#: Why an exposure was left out that the user wanted to be.
-ASKED = "as asked (--without)"

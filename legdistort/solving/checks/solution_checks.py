@@ -13,6 +13,7 @@ import numpy as np
 from scipy import special
 
 from ...exceptions import reasons_of, some_of
+from ...inputs.exposure_names import ASKED
 from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
 from ...results.errors.header_pointing import CURE as POINTING_CURE
 from ...results.gauge import warning_of
@@ -21,7 +22,7 @@ from .camera_check import camera_check, contradicted_layout, undetermined
 from .cures import with_cures, without_static
 from .dynamic_check import EVIDENCE, dynamic_check, nights_check, significance
 from .extrapolated_maps import extrapolation_check
-from .limits import ALIKE, ASKED, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
+from .limits import ALIKE, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
 from .reference_check import reference_check
 from .residual_tests import Residuals
