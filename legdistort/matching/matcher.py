@@ -160,10 +160,8 @@ def match(
     check_camera(camera)
     detections = column_contract.rename(detections, columns) if columns else detections
     table = column_contract.check(detections, column_contract.DETECTED, "the table of detections")
-    table["exposure"] = table["exposure"].astype(str)
-    if exposures is not None:
-        exposures = listed(exposures, "match")
-        table = without_bad_places(table, exposures)
+    exposures = None if exposures is None else listed(exposures, "match")
+    table = without_bad_places(table, exposures or ())
     if camera is None:
         if detector_layout.is_needed(table, exposures):
             if start is not None:

@@ -15,6 +15,8 @@ log = logging.getLogger(__name__)
 def without_bad_places(table, exposures):
     """The table without rows whose pixel the frame calls bad: no weight, a flag, NaN. How many is said once.
 
+    Names of exposures become texts.
+
     What `legdistort.measure` found (column ``crowding``) is taken as it is: it knew of bad pixels, and has flags.
 
     Parameters
@@ -28,6 +30,7 @@ def without_bad_places(table, exposures):
     MatchError
         If nothing is left.
     """
+    table["exposure"] = table["exposure"].astype(str)
     if "crowding" in table.colnames or not len(table):
         return table
     bad, names = np.zeros(len(table), dtype=bool), np.asarray(table["exposure"])
