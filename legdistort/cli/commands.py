@@ -159,10 +159,11 @@ def do_match(a):
     read = told_apart([(Path(path), read_given(path, a, contract)) for path in a.tables])
     camera = given_camera(a.camera) or _measured_with(read.values())
     if a.wcs is None:
-        refuse({"ext": a.ext}, "is for the frames of --wcs")
+        refuse({"ext": a.ext} | given(a, options.FLAGGED), "is for the frames of --wcs")
         exposures = None
     else:
-        exposures = open_wcs(a.wcs, ext=a.ext, shape=a.shape and tuple(a.shape))
+        reading = given(a, {"ext": options.WCS_OF_TABLES["ext"]}, options.FLAGGED)
+        exposures = open_wcs(a.wcs, **reading, shape=a.shape and tuple(a.shape))
         exposures = camera.of_detectors(exposures) if camera else exposures  # a list has the detector of its frame
         read = {path: named_after(table, exposures, path) for path, table in read.items()}
     tables = list(read.values())

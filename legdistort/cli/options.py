@@ -387,7 +387,7 @@ ATTACHING = {
         required=True,
     ),
     "tpv": Option("header for SWarp and SCAMP (default: SIP)", action="store_true", one_of="header"),
-    "head": Option("texts NAME.head for SWarp and SCAMP, no copies of frames", action="store_true", one_of="header"),
+    "head": Option("texts NAME.head for SWarp, no copies of frames", action="store_true", one_of="header"),
     "asdf_only": Option("leave the header alone, add the exact WCS", action="store_true", one_of="header"),
     "max_error": Option("of the header, pixels (default 0.001)", type=float),
     "overwrite": Option("replace copies and ASDF extensions that exist", action="store_true"),

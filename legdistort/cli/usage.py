@@ -78,6 +78,7 @@ COMMANDS = {
         options.out("table (ECSV) of matched positions", endings=options.TABLE_ENDINGS),
         options.TABLE,
         options.WCS_OF_TABLES,
+        options.FLAGGED,
         options.CAMERA,
         options.MATCHING,
     ),

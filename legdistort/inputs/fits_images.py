@@ -17,7 +17,7 @@ from .frames.cards import Stated
 from .frames.pixel_flags import bad_pixels, descriptive_flags
 from .frames.statement import read_statement
 from .frames.wcs_cards import header_of_image, is_left_out, make_numbers, two_matrices
-from .frames.weight_maps import bad_and_sky_errors, doubt_of_rms
+from .frames.weight_maps import NO_WEIGHT, bad_and_sky_errors, doubt_of_rms
 from .sky_wcs import believable_wcs, header_wcs
 
 log = logging.getLogger(__name__)
@@ -178,7 +178,7 @@ def with_weights(exposure, weights, kind):
 def with_weights_stated(exposure, path, doubt):
     """An exposure with a weight map, whose statement names the map, and what is doubtful about it."""
     before = exposure.stated.mask
-    words = [before.value, "without weight"] if before.value else ["without weight"]
+    words = [before.value, NO_WEIGHT] if before.value else [NO_WEIGHT]
     source = f"{before.source}, {path.name}" if before.value else path.name
     stated = replace(exposure.stated, mask=Stated(" and ".join(words), source))
     return replace(exposure, stated=stated.with_doubt(doubt) if doubt else stated)

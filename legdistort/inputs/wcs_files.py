@@ -16,12 +16,12 @@ from .sky_wcs import believable_wcs
 PLACES = ("meta", "wcs"), ("roman", "meta", "wcs"), ("wcs",)
 
 
-def open_wcs(paths, *, ext=None, shape=None):
+def open_wcs(paths, *, ext=None, dq_good=None, weight_maps=None, shape=None):
     """Exposures of images, as `legdistort.open_exposures`, and of ASDF files with a gwcs alone.
 
     Parameters
     ----------
-    paths, ext
+    paths, ext, dq_good, weight_maps
         As there.
     shape : tuple, optional
         ``(ny, nx)`` of the images of a gwcs that does not state it (``pixel_shape``, or the end of its bounding box).
@@ -45,7 +45,7 @@ def open_wcs(paths, *, ext=None, shape=None):
             bare.append(_of_tree(Path(source), tree, shape))
     if shape is not None and not bare:
         raise InputError("--shape comes from the frames of --wcs: leave it out")
-    out = (open_exposures(images, ext=ext) if images else []) + bare
+    out = (open_exposures(images, ext=ext, dq_good=dq_good, weight_maps=weight_maps) if images else []) + bare
     return with_detectors(told_apart(out)) if bare else out
 
 

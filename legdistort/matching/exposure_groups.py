@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.stats import poisson
 
 from ..geometry import similarity
 from ..measurement.flags import PERSISTS
@@ -26,6 +27,10 @@ BLIND_TRIES = 8
 PARTNERS = 3
 #: Stars that two exposures ought to share before a failure to register counts against them.
 ENOUGH = 25
+#: Chance of so many detections on a line; half the breadth of it, and of the strip about it that tells chance [pix].
+CROWD, BREADTH, BESIDE = 1e-5, 2.0, 20.0
+#: With more than this part of the detections on crowded columns, and on rows too, they are a lattice.
+LATTICE = 0.25
 #: A pair is registered anew when it holds less than this part of the stars that the exposures share by all other pairs.
 COMPLETE = 0.97
 
@@ -96,7 +101,7 @@ def _gather(lists, hub, left, guess, tolerance):
 
 
 def standing(lists, group, *, radius=0.6, moved=1.5):
-    """Detections that stay at the same pixel while the sky moves: hot pixels.
+    """Detections that stay at the same pixel, or crowd on the same column or row, while the sky moves: hot pixels.
 
     A star of which an image persists at its place in the next exposures is ten times as bright as that, or more: what
     is so much fainter says nothing of a detection.
@@ -136,7 +141,47 @@ def standing(lists, group, *, radius=0.6, moved=1.5):
         away = np.hypot(*(_carried(poses, group.poses[i], xy[several]) - xy[several].T[:, None])) > moved
         same = np.count_nonzero(here[:, several] & away, axis=0)
         out[i][several] = (same >= 3) & (same >= 0.5 * np.count_nonzero(away, axis=0))
+        out[i] |= _on_lines(lists, members, i, poses, radius, moved)
     return out
+
+
+def _on_lines(lists, members, own, poses, radius, moved):
+    """Detections (n,) of one exposure of a group on columns, or rows, that are crowded in it and in those moved away.
+
+    Those of a lattice crowd on both, and are no defects.
+
+    Parameters
+    ----------
+    lists : list of StarList
+    members : list of int
+        Exposures of the group.
+    own : int
+        Which exposure it is.
+    poses : ndarray, shape (n_members, 2, 3)
+    radius, moved
+        As in `standing`.
+    """
+    xy, out = lists[own].xy, np.zeros(len(lists[own]), dtype=bool)
+    crowded = [_is_crowded(xy[:, axis], xy[:, axis], radius, 1) for axis in (0, 1)]
+    if min(map(np.count_nonzero, crowded)) > LATTICE * len(xy):
+        return out
+    for axis, rows in enumerate(map(np.flatnonzero, crowded)):
+        away = np.abs(_carried(poses, poses[members.index(own)], xy[rows])[axis] - xy[rows, axis]) > moved
+        too = [_is_crowded(lists[i].xy[:, axis], xy[rows, axis], radius, 0) for i in members]
+        same = np.count_nonzero(away & too, axis=0)
+        out[rows[(same >= 3) & (same >= 0.5 * np.count_nonzero(away, axis=0))]] = True
+    return out
+
+
+def _is_crowded(places, at, radius, itself):
+    """Whether more places lie within a radius of others than chance makes of those in the strip about these."""
+    ordered = np.sort(places)
+
+    def within(r):
+        return np.searchsorted(ordered, at + r, "right") - np.searchsorted(ordered, at - r)
+
+    expected = np.maximum(within(BESIDE) - within(BREADTH), 1) * radius / (BESIDE - BREADTH)
+    return poisson.sf(within(radius) - itself - 1, expected) < CROWD
 
 
 def without(group, dropped):

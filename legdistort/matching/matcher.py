@@ -23,6 +23,7 @@ from ..inputs.column_contract import colour_column
 from ..inputs.exposure_files import ExposureFile, listed
 from ..inputs.exposure_names import whole_name
 from ..inputs.exposures import Exposure, stated_numbers
+from ..inputs.star_lists.bad_places import without_bad_places
 from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE, Flag
@@ -159,8 +160,8 @@ def match(
     check_camera(camera)
     detections = column_contract.rename(detections, columns) if columns else detections
     table = column_contract.check(detections, column_contract.DETECTED, "the table of detections")
-    table["exposure"] = table["exposure"].astype(str)
     exposures = None if exposures is None else listed(exposures, "match")
+    table = without_bad_places(table, exposures or ())
     if camera is None:
         if detector_layout.is_needed(table, exposures):
             if start is not None:
@@ -424,7 +425,10 @@ def _associate(lists, names, headers, left_out, options):
     groups = grouped(lists)
     hot = standing(lists, groups[0])
     if any(h.any() for h in hot):
-        log.info("%d detections stand still while the sky moves: hot pixels, not used", sum(h.sum() for h in hot))
+        log.info(
+            "%d detections stand still while the sky moves: hot pixels or bad columns, not used",
+            sum(h.sum() for h in hot),
+        )
         lists = [stars.subset(~h) for stars, h in zip(lists, hot, strict=True)]
         few = max(h.mean() for h in hot) < FEW_HOT  # they have not led the registrations astray
         groups = [without(group, hot) for group in groups] if few else grouped(lists)

@@ -4,6 +4,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..exceptions import AssumptionWarning, some_of, warn
+from ..inputs.frames.weight_maps import NO_WEIGHT
 from .camera_gain import camera
 from .flags import PERSISTS, TRAILED, UNUSABLE, Flag
 from .profiles import moffat
@@ -15,7 +16,9 @@ _FEWEST = 3  # exposures in which it is found, at least
 _COMPARED = 100  # exposures, of more evenly chosen ones, in which it is looked for
 _BRIGHTEST = 30  # rows of an exposure by which it is told whether the sky moves
 _BRIGHT = 20.0  # standard deviations of the sky, of peaks of stars that a mask hides
+_BESIDE = 0.1  # of its peak that a star has on both sides of it, and below and above: columns and rows have not
 _HIDDEN = 5  # such peaks from which on it is said
+_CROSS = (0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)  # a pixel, then those on both sides, below and above
 
 
 def flag_what_stays(tables, exposures):
@@ -83,18 +86,30 @@ def hides_most(exposure, frame, centres):
     for k, (dy, dx) in enumerate(np.ndindex(3, 3)):
         other = exposure.data[y + dy - 1, x + dx - 1]
         highest &= (value > other) if k < 4 else (value >= other)
-    peaks = np.column_stack([x, y])[highest]
+    x, y = x[highest], y[highest]
+    light = np.stack([exposure.data[y + dy, x + dx] - frame.sky[y + dy, x + dx] for dx, dy in _CROSS])
+    extended = (light[1:] > _BESIDE * light[0]).all(axis=0)
+    peaks = np.column_stack([x, y])[extended]
     stars = np.count_nonzero(~are_points(exposure.data - frame.sky, np.zeros(len(peaks)), peaks))
     seen = np.count_nonzero(frame.signal[centres[:, 1], centres[:, 0]] > limit)
     return stars > max(seen, _HIDDEN - 1)
 
 
-def warn_of_hidden(names):
-    """Warn of exposures of which the mask hides most bright stars."""
-    if names:
+def warn_of_hidden(exposures):
+    """Warn of exposures of which the mask hides most bright stars; a weight map alone is named as one."""
+    found = {True: [], False: []}
+    for each in exposures:
+        found[each.stated is not None and each.stated.mask.value == NO_WEIGHT].append(each.name)
+    if found[False]:
         warn(
-            f"{some_of(names, 3)}: most bright stars lie on pixels that the plane of flags calls bad; if a flag only "
-            "describes what is there, name it as good: dq_good= (--dq-good)",
+            f"{some_of(found[False], 3)}: most bright stars lie on pixels that the plane of flags calls bad; if a flag "
+            "only describes what is there, name it as good: dq_good= (--dq-good)",
+            AssumptionWarning,
+        )
+    if found[True]:
+        warn(
+            f"{some_of(found[True], 3)}: most bright stars lie on pixels without weight in the weight map; if it is "
+            "none, or of another frame, leave it out: weight_maps='none' (--weight-maps none)",
             AssumptionWarning,
         )
 

@@ -292,7 +292,7 @@ def measure_with_psfs(exposures, options, *, workers=None, progress=False):
     _warn_of_gain({name: one.photon for name, one in zip(names, found, strict=True)})
     doubtful = {name: one.noise_ratio for name, one in zip(names, found, strict=True) if one.noise_ratio is not None}
     camera_gain.warn_of_contradictions(doubtful, {e.name: options.gain or e.gain for e in exposures})
-    across_frames.warn_of_hidden([name for name, one in zip(names, found, strict=True) if one.hidden])
+    across_frames.warn_of_hidden([each for each, one in zip(exposures, found, strict=True) if one.hidden])
     across_frames.warn_of_trails({n: one.shape for n, one in zip(names, found, strict=True) if one.shape is not None})
     across_frames.flag_what_stays([one.table for one in found], exposures)
     verdicts = {name: one.verdict for name, one in zip(names, found, strict=True)}

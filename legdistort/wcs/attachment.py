@@ -117,11 +117,12 @@ def attach(
         given.
     kind : {"sip", "tpv", "head", None}
         Form of the header; None leaves it alone and adds the ASDF extension only. "head" leaves the frames alone, and
-        writes the cards (TPV) of the images of each into a text ``NAME.head``, which SWarp and SCAMP read in the place
-        of its headers: beside the frames, or into the folder `out` without them. With GAIN and SATURATE, which SWarp
-        reads, where the frames state them under other keywords, and with FLXSCALE, the factor that brings the values of
-        a frame to those of one of mean depth, where the fluxes of common stars join all exposures of the solution;
-        fluxes of lists must be in the unit of the pixels, as ``FLUX_AUTO`` is.
+        writes the cards (TPV) of the images of each into a text ``NAME.head``, which SWarp reads in the place of its
+        headers (SCAMP writes files of this name, and reads ``NAME.ahead``): beside the frames, or into the folder `out`
+        without them. With GAIN and SATURATE, which SWarp reads, where the frames state them under other keywords, and
+        with FLXSCALE, the factor that brings the values of a frame to those of one of mean depth, where the fluxes of
+        common stars join all exposures of the solution; fluxes of lists must be in the unit of the pixels, as
+        ``FLUX_AUTO`` is.
     max_error : float
         Largest error of the header, pixels.
     ext : int, str or (str, int), optional

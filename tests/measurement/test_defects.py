@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.io import fits
 from astropy.table import QTable
 from caller_warnings import warns_here
 from dirty_detector import cosmic_rays
@@ -10,6 +11,7 @@ from scipy.spatial import cKDTree
 from star_images import GAIN, READ_NOISE, SKY, errors, image, observe, positions, scattered, usable
 
 from legdistort.exceptions import AssumptionWarning
+from legdistort.inputs.exposure_files import read_exposures
 from legdistort.inputs.exposures import Exposure
 from legdistort.matching.matcher import match
 from legdistort.measurement.across_frames import flag_what_stays
@@ -234,6 +236,20 @@ def test_a_mask_that_hides_most_stars_is_named():
             measure(Exposure("e0", exposure.data, light > least, gain=GAIN, read_noise=READ_NOISE), psf="moffat")
     (exposure,), (added,) = night(hot_pixels, frames=1)
     measure(Exposure("e0", exposure.data, added > 0, gain=GAIN, read_noise=READ_NOISE), psf="moffat")
+
+
+@pytest.mark.slow
+def test_bad_columns_hide_no_stars_and_a_weight_map_is_named(tmp_path):
+    rng, light = np.random.default_rng(3), image((SIZE, SIZE), *stars(), 3.0)
+    weights, cards = np.ones((SIZE, SIZE), "f4"), fits.Header({"GAIN": GAIN, "RDNOISE": READ_NOISE})
+    weights[:, [20, 21, 60, 90, 91, 110]] = 0
+    data = np.where(weights > 0, observe(light, rng), rng.normal(SKY + 4000, 1500, light.shape))
+    for name, bad in (("columns", weights == 0), ("stars", light - SKY > 20)):
+        fits.writeto(tmp_path / f"{name}.fits", data.astype("f4"), cards)
+        fits.writeto(tmp_path / f"{name}.weight.fits", np.where(bad, 0, weights).astype("f4"))
+    measure(read_exposures(tmp_path / "columns.fits"), psf="moffat")
+    with warns_here(AssumptionWarning, match=r"stars: most bright stars .* without weight .*--weight-maps none"):
+        measure(read_exposures(tmp_path / "stars.fits"), psf="moffat")
 
 
 @pytest.mark.parametrize("angle", [pytest.param(0, marks=pytest.mark.slow), 140])

@@ -12,6 +12,8 @@ from ...exceptions import InputError
 KINDS = ("MAP_WEIGHT", "MAP_VARIANCE", "MAP_RMS")
 #: SWarp's ``WEIGHT_SUFFIX``.
 SUFFIX = ".weight.fits"
+#: What pixels are called that a map alone says are bad.
+NO_WEIGHT = "without weight"
 _ENDINGS = (".fits", ".fit", ".fts", ".fits.fz", ".fits.gz")
 _HUGE = 1e30  # variances from which SWarp and SExtractor take a pixel for one without weight
 _ALIKE = 0.01  # by which the noise of good pixels may differ in a map that only tells good from bad ones
