@@ -384,9 +384,13 @@ class Camera(ShownAsPrinted):
         return {"name": self.name, "field": list(self.field), "detectors": detectors}
 
     def table_lines(self) -> list[str]:
-        """Lines of a table of where the detectors lie, with the errors of that where it is not exact."""
+        """Lines of a table of where the detectors lie, with the errors of that where it is not exact.
+
+        Where nothing is known of that for any detector, a last line says so.
+        """
         places = self.places
-        known = any(place.errors is not None for place in places.values())
+        unknown = all(place.errors is not None and not np.isfinite(place.errors).any() for place in places.values())
+        known = any(place.errors is not None for place in places.values()) and not unknown
         errors, width = f" {'+-':>8s}" * known, max(10, *map(len, places))
         lines = [
             f"{'detector':{width}s} {'size [px]':>13s} {'centre x':>10s}{errors} {'centre y':>10s}{errors} "
@@ -401,7 +405,7 @@ class Camera(ShownAsPrinted):
                 f"{key:{width}s} {f'{nx} x {ny}':>13s} {place.x:10.2f}{x} {place.y:10.2f}{y} "
                 f"{place.rotation:9.4f}{rotation} {place.scale:9.6f} {self[key].rms:8.3f}"
             )
-        return lines
+        return lines + ["        errors of the layout: not known"] * unknown
 
     @classmethod
     @plain_numbers

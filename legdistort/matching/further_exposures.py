@@ -43,14 +43,14 @@ def with_further(solution, matches):
     Raises
     ------
     InputError
-        For an exposure that the solution has already, and for another camera.
+        For an exposure that the solution has already, for another camera, and for that which the solution found.
 
     Warns
     -----
     AssumptionWarning
         Naming exposures that are another field.
     """
-    _check_camera(solution.camera, matches.camera)
+    _check_camera(solution, matches.camera)
     before = solution.residuals.copy(copy_data=False)
     before.remove_columns(_ADDED)
     before, after = solution.camera.on_detectors(before), matches.camera.on_detectors(matches.table.copy())
@@ -79,13 +79,30 @@ def with_further(solution, matches):
     )
 
 
-def _check_camera(known, given):
-    """Raise `InputError` unless detectors of both cameras go by the same names."""
+def _check_camera(solution, given):
+    """Raise `InputError` unless detectors of both cameras go by the same names; for the camera that was found, too.
+
+    Its errors are by the exposures of the solution, which would be believed twice.
+    """
+    known = solution.camera
     if known.has_focal_plane != given.has_focal_plane or set(known.detectors) != set(given.detectors):
         raise InputError(
             f"the solution is of camera {known.name} (detectors {', '.join(known.detectors)}), and the exposures that "
-            f"come in are of {given.name} ({', '.join(given.detectors)}): match them with the camera of the solution"
+            f"come in are of {given.name} ({', '.join(given.detectors)}): match them as those of the solution were"
         )
+    errors = [error for each in known.detectors.values() for error in (each.layout_sigma, each.static_sigma)]
+    is_found = any(error is not None for error in errors) or (known.common_map is not None and solution.gauge.tie)
+    if known.has_focal_plane and is_found and all(_is_alike(known[key], given[key]) for key in known.detectors):
+        raise InputError(
+            f"the exposures that come in have the camera {known.name} as the solution found it, whose own exposures "
+            "would count twice: match them as those of the solution were, with the camera that these were given, or, "
+            "if their files told how the detectors lie, without any (leave out camera=, --camera)"
+        )
+
+
+def _is_alike(one, two):
+    """Whether two detectors have the same layout and static distortion, to the last bit."""
+    return np.array_equal(one.layout, two.layout) and np.array_equal(one.static, two.static)
 
 
 def _check_new(before, after):

@@ -176,7 +176,7 @@ def match(
             return detector_layout.match_parts(table, shapes, lambda parts, shape: match(parts, shape=shape, **again))
         if any(exposure.detector is not None for exposure in exposures or ()):
             camera = Camera.of_frames(exposures)
-            log.info("layout of the detectors by the headers: %s", camera)
+            log.info("layout of the detectors by the headers, from which solve begins to find it: %s", camera)
     elif any(exposure.detector is not None for exposure in exposures or ()):
         camera = camera.with_headers(exposures)
     if camera is not None:

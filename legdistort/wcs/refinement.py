@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+#: A WCS that is farther off than this part of the diagonal is compared with the other images of the solution, and is
+#: that of another one which it is so many times nearer to. Pointings of headers may be wrong by as much, by chance not
+#: just as another image lies.
+_OFF, _NEARER = 0.05, 10
+
 
 def refine(wcs: GWCS, view: View) -> GWCS:
     """A gwcs like the one given, but with the distortion and the pose that a solution found for an exposure.
@@ -46,8 +51,8 @@ def refine(wcs: GWCS, view: View) -> GWCS:
     Raises
     ------
     InputError
-        If `wcs` is no such gwcs, is of another detector or place on the sky, or its later transforms cannot be
-        inverted; if the solution does not know the sky; if it is none of a view.
+        If `wcs` is no such gwcs, is of another detector, exposure or place on the sky, or its later transforms cannot
+        be inverted; if the solution does not know the sky; if it is none of a view.
 
     See Also
     --------
@@ -121,6 +126,15 @@ def _check_place(wcs, view):
             f"wcs and exposure {name} of the solution lie {apart:.3g} apart on the sky, more than the detector is "
             "wide: is it the WCS of another exposure?"
         )
+    if apart > _OFF * size:
+        others = {part.label: part for each in view.solution for part in each.parts if part.shape == view.shape}
+        moves = {label: corner_move(wcs, part)[0] for label, part in others.items() if label != name}
+        nearest = min(moves, key=moves.get, default=None)
+        if nearest is not None and _NEARER * moves[nearest] < apart:
+            raise InputError(
+                f"wcs is {apart.arcsec:.3g} arcsec off exposure {name} of the solution, and "
+                f"{moves[nearest].arcsec:.3g} arcsec off {nearest}: it is the WCS of that one; give its view"
+            )
     log.debug("%s: corners move by up to %.3g arcsec", name, apart.arcsec)
 
 

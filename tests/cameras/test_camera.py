@@ -143,6 +143,12 @@ class TestCamera:
         assert repr(gsaoi) == "<Camera GSAOI: 4 detectors in a focal plane of 4301 x 4276 px>"
         assert str(gsaoi).splitlines()[3].split() == ["2", "2048", "x", "2048", "1085.30", "1034.40", "0.0237",
                                                       "0.991644", "2.900"]  # fmt: skip
+        unknown = {k: replace(each, layout_sigma=np.inf) for k, each in two_chips().detectors.items()}
+        start = str(legdistort.Camera("start", unknown))
+        assert start.endswith("errors of the layout: not known")
+        assert "inf" not in start
+        assert "+-" not in start
+        assert str(two_chips(layout_sigma=0.1)).count("+-") == 3
 
     def test_file(self, gsaoi, tmp_path):
         known = two_chips(layout_sigma=0.1, static_sigma=0.02)

@@ -136,6 +136,20 @@ def test_the_next_visit_has_the_scale_and_the_rotation_of_the_first(night, first
     assert "--prior" not in absolute.cure
 
 
+@pytest.mark.slow
+def test_the_next_visit_comes_into_the_first(night, first, catalogue):
+    """Its layout that of its headers, as in the first; with the camera that this found it would count twice."""
+    with pytest.raises(InputError, match=r"with a reference, of which .*: give it again, reference= \(--reference\)$"):
+        ld.solve(matched(night, 1), base=first)
+    with pytest.raises(InputError, match="camera FOUR as the solution found it, whose own exposures would count twice"):
+        ld.solve(matched(night, 1, first.camera), base=first, reference=catalogue)
+    both = ld.solve(matched(night, 1), base=first, reference=catalogue)
+    assert len(both.names) == 10
+    scale, turn, left = off_sky(night, both)
+    assert [scale, turn] == pytest.approx([0, 0], abs=1e-3)
+    assert left**2 < 1.5 * np.mean(np.square([both.stars[name].value for name in ("x_err_abs", "y_err_abs")]))
+
+
 def test_the_errors_of_the_common_map_are_those_of_the_reference(first):
     """20 mas of a pixel in each of 80 stars, noise aside: a coefficient is known to a few thousandths of a pixel."""
     sigma = first.camera.common_sigma

@@ -1,6 +1,5 @@
 """Exposures that come into a finished solution: as if all had been solved together from the beginning."""
 
-import re
 import warnings
 
 import drawn_sets
@@ -128,6 +127,17 @@ def test_a_size_of_the_static_distortion_stays():
     assert found.chi2 == given.chi2
 
 
+@pytest.mark.parametrize("sigma", [pytest.param("evidence", marks=pytest.mark.slow), 0.02])
+def test_the_scatter_of_exposures_stays(sigma):
+    """Without a mean widths are all that there is to keep of a prior, as the command line has it for --prior-sigma."""
+    old, new = parts(simulated(n=4, dynamic=0.02).matches.table, ["exp03"])
+    known = ld.Prior(None, sigma="evidence").with_sigma(sigma, degree=1)
+    base = ld.solve(old, prior=known, degree=1, clip=None)
+    found, given = ld.solve(new, base=base), ld.solve(new, base=base, prior=known)
+    assert found.settings.prior == base.settings.prior
+    assert found.chi2 == given.chi2
+
+
 def test_new_stars_join_if_two_exposures_see_them():
     table = simulated().matches.table
     late, seen = ["exp06", "exp07"], np.unique(table["star"])
@@ -178,8 +188,12 @@ def test_of_a_camera():
     found = ld.solve(new, base=ld.solve(old, degree=2))
     whole = ld.solve(ld.Matches.from_table(table, camera=camera), degree=2)
     assert max(off(found, whole, 2)[1:]) < 1e-3
+    fitted = ld.solve(old, degree=2, layout="fit")
+    known = ld.Matches.from_table(new.camera.on_detectors(new.table.copy()), camera=fitted.camera)
+    with pytest.raises(InputError, match="camera TWO as the solution found it, whose own exposures would count twice"):
+        ld.solve(known, base=fitted)
     plain = ld.Matches.from_table(simulated().matches.table, shape=SHAPE)
-    with pytest.raises(InputError, match=r"is of camera TWO \(detectors 1, 2\), and the exposures .* with the camera"):
+    with pytest.raises(InputError, match=r"is of camera TWO \(detectors 1, 2\), .* match them as those of"):
         ld.solve(plain, base=found)
 
 
@@ -229,7 +243,7 @@ def test_refused(tmp_path):
     posed = ld.Matches.from_table(old.table, shape=SHAPE, poses=old.poses)
     refused("nothing can be added to the base, the poses", base=ld.solve(posed, pose_sigma={"shift": 1.0}))
     with_prior = ld.solve(old, prior=EVIDENCE)
-    refused(re.escape("solved with a prior, of which it keeps a description alone: give it again (prior=, --prior)"),
+    refused(r"solved with a prior, of which it keeps a description alone: give it again, prior= \(--prior\)$",
             base=with_prior)  # fmt: skip
     elsewhere = new.table.copy()
     for seed, axis in enumerate("xy"):
@@ -239,6 +253,8 @@ def test_refused(tmp_path):
         ld.solve(ld.Matches.from_table(elsewhere, shape=SHAPE), base=base)
     tied = ld.solve(old, reference=base)
     refused("solved with a reference, of which", base=tied)
+    both = ld.solve(old, reference=base, prior=dict.fromkeys(old.names, ld.Prior(np.zeros((2, 10)))))
+    refused(r"with a prior and a reference, .*: give both again, prior= \(--prior\), reference= \(--ref", base=both)
     assert len(ld.solve(new, base=tied, reference=base).names) == 8
 
 

@@ -13,7 +13,7 @@ from astropy.modeling import models
 from gwcs import coordinate_frames as cf
 from gwcs.geometry import CartesianToSpherical, SphericalToCartesian
 from numpy.testing import assert_allclose, assert_array_equal
-from sky_chains import detector, solution_at
+from sky_chains import detector, geometries, solution_at
 
 import legdistort
 from legdistort.exceptions import InputError
@@ -152,6 +152,23 @@ def test_what_cannot_be_refined(change, words):
     wcs, solution = change(wcs, solution_at(wcs, SHAPE))
     with pytest.raises(InputError, match=words):
         legdistort.refine(wcs, solution["a"])
+
+
+@pytest.mark.parametrize("dither", [60.0, -60.0, 20.0])
+def test_the_wcs_of_another_exposure(dither):
+    """As long as the two are farther apart than headers may be wrong: 5 % of the diagonal, 34 px here."""
+    wcs = pipeline()
+    made = geometries()(3, 1.0, shape=SHAPE, turn=0.0, names=("a", "b"))
+    poses = {"a": np.eye(2, 3), "b": np.array([[1.0, 0.0, dither], [0.0, 1.0, 0.0]])}
+    solution = replace(made, sky=solution_at(wcs, SHAPE).sky, poses=poses)
+    legdistort.refine(wcs, solution["a"])
+    if dither == 20.0:
+        legdistort.refine(wcs, solution["b"])
+        return
+    with pytest.raises(InputError, match=r"wcs is 3\.\d+ arcsec off exposure b .* off a: it is the WCS of that one"):
+        legdistort.refine(wcs, solution["b"])
+    wrong = pipeline(lon=10.0 + 3.0 / 3600)  # a pointing, and no other exposure there
+    legdistort.refine(wrong, solution["a"])
 
 
 def test_an_exposure_that_is_not_there():

@@ -79,7 +79,9 @@ class HeaderPointing:
         error = 1000 * pixel_scale * self.shift
         size = f"{error:.2g}" if error < 100 else f"{error:.0f}"
         turn = f", of its rotation {self.turn:.2g} deg" if np.isfinite(self.turn) else ""
-        scale = f"by a reference of camera {camera}" if camera else "as they state it"
+        scale = "as they state it"
+        if camera:
+            scale = f"by a reference of camera {camera}, as is the rotation but for by how much their rolls differ"
         return (
             f"by their scatter the error of its pointing is {size} mas per axis at least{turn}; what they all have "
             "wrong alike (guide stars, roll) adds to that and is not known; ra_error_abs and dec_error_abs leave this "

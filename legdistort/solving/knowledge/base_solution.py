@@ -4,7 +4,10 @@ from dataclasses import fields, replace
 from functools import wraps
 from pathlib import Path
 
+import numpy as np
+
 from ...exceptions import InputError
+from ...geometry import basis
 from ...inputs.repetitions import fingerprints
 from ...matching.further_exposures import with_further
 from ...matching.matches import Matches
@@ -12,6 +15,7 @@ from ...priors.prior import Prior
 from ...results.settings import Settings
 from ...results.solution import Solution
 from ...runtime.provenance import now
+from ...runtime.words import UNSTATED
 
 #: Settings that are no arguments of `legdistort.solve`, or none that are kept in full.
 _NOT_KEPT = {"prior", "model", "method", "gauge"}
@@ -56,30 +60,37 @@ def _check(base, given):
             raise InputError(f"nothing can be added to the base, {why}: solve all exposures together")
     internal = (settings.prior or {}).get("source") == f"camera {base.camera.name}"
     needed = {
-        "prior": settings.prior is not None and not internal and settings.model is None and _sizes(settings) is None,
+        "prior": settings.prior is not None and not internal and settings.model is None and _widths(settings) is None,
         "model": settings.model is not None,
         "reference": base.diagnostics.reference is not None,
     }
-    for name in needed:
-        if needed[name] and given.get(name) is None:
-            words = f"{name}=" + f", --{name}" * (name != "model")
-            raise InputError(
-                f"the base was solved with a {name}, of which it keeps a description alone: give it again ({words})"
-            )
+    if missing := [name for name in needed if needed[name] and given.get(name) is None]:
+        words = ", ".join(f"{name}=" + f" (--{name})" * (name != "model") for name in missing)
+        raise InputError(
+            f"the base was solved with a {' and a '.join(missing)}, of which it keeps a description alone: give "
+            f"{'it' if len(missing) == 1 else 'both'} again, {words}"
+        )
 
 
 def _options(base):
     """The arguments of `solve` that the base was made with."""
     left = _NOT_KEPT | {"degree"} if base.settings.model is not None else _NOT_KEPT  # which a model has
     kept = {each.name: getattr(base.settings, each.name) for each in fields(Settings) if each.name not in left}
-    return kept | {"prior": _sizes(base.settings)}
+    return kept | {"prior": _widths(base.settings)}
 
 
-def _sizes(settings):
-    """The prior of settings that states sizes alone, of which the description is all; None for another one, or none."""
-    if settings.prior is None or settings.prior["degree"] is not None:
+def _widths(settings):
+    """The prior of settings that states widths alone, of which the description is all; None for another one, or none.
+
+    That is the size of a static distortion, or how far exposures scatter about one of which nothing is stated.
+    """
+    known = settings.prior or {}
+    if known.get("source") == UNSTATED:
+        mean = np.zeros((2, basis.n_modes(known["degree"])))
+        return Prior(mean, sigma=known["sigma"], source=UNSTATED)
+    if not known or known.get("degree", 0) is not None:  # by exposure or by detector there is none
         return None
-    return Prior(None, sigma=settings.prior["sigma"], static_sigma=settings.prior["static_sigma"])
+    return Prior(None, sigma=known["sigma"], static_sigma=known["static_sigma"])
 
 
 def _log(base, matches):
