@@ -118,6 +118,14 @@ def test_a_run_goes_on_with_what_it_was_told(tmp_path, capsys, monkeypatch):
     assert (
         legdistort.run(earlier="second", out="third", mosaic=False).solution.settings.degree == 3
     )  # Python states all
+    assert main(["run", "--from", "first", "--without", "exp9*", "--out", "fourth"]) == 1
+    assert "--without exp9* is none of the exposures: exp00, exp01, exp02, exp03" in capsys.readouterr().err
+    assert main(["run", "--from", "first", "--without", "exp01", "--min-exposures", "3", "--out", "fourth"]) == 0
+    solution = Solution.read("fourth")
+    assert solution.names == ("exp00", "exp02", "exp03")
+    assert solution.left_out == {"exp01": "as asked (--without)"}
+    assert main(["run", "--from", "fourth", "--out", "fifth"]) == 0  # of the frames that are left
+    assert Solution.read("fifth").names == solution.names
 
 
 @pytest.mark.parametrize(

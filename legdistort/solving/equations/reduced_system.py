@@ -292,7 +292,7 @@ def _singular_message(problem, s):
     return (
         f"the observations do not determine the distortion of degree {problem.degree} "
         f"(smallest eigenvalue {values[0]:.1e} of the normalised equations), above all in exposure {', '.join(worst)}: "
-        "leave out an exposure that hardly overlaps the others (solve --without), lower the degree, add stars, or give "
+        "leave out an exposure that hardly overlaps the others (--without), lower the degree, add stars, or give "
         "a prior with sigma"
     )
 
