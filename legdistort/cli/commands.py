@@ -18,18 +18,15 @@ from ..inputs import column_contract
 from ..inputs.detector_files import warn_of_detectors
 from ..inputs.star_lists.formats import stack
 from ..inputs.table_files import named_after, named_as_known, names_of_images, records, told_apart, write_stars
-from ..priors.prior import EVIDENCE, HEADER, HeaderPrior
 from ..results.check import WRONG, Check, worst
 from ..runtime import outputs, parallel, provenance
 from ..runtime.trees.codec import from_tree
-from ..runtime.words import UNSTATED
-from ..solving.choices.degree_choice import AUTO, HIGHEST
-from ..solving.options import DEGREE
 from . import options
 from .arguments import flagged, given, lines_of_images, wants_progress
 from .given_files import (
     given_camera,
     given_prior,
+    given_solving,
     grid_in,
     known_file,
     read_given,
@@ -83,7 +80,7 @@ def do_run(a):
     measuring, matching, solving = (
         given(a, options.MEASURING),
         given(a, options.MATCHING),
-        _solving(a),
+        given_solving(a),
     )
     own = ("psf", "degree", "prior", "clip", "min_exposures", "reference", "pixel_scale", *_TYING)
     with pipeline.called_by(a.begun, repeatable(a)):
@@ -214,7 +211,7 @@ def do_solve(a):
         check_results(a.out, a.overwrite)  # again: nobody else writes there any more
         matches, inputs = read_matches(a)
         with timed({}, "solve"):
-            asked = given(a, options.BASE) | _solving(a, matches)
+            asked = given(a, options.BASE) | given_solving(a, matches)
             solution = legdistort.solve(matches, **asked, progress=wants_progress(a))
         solution = provenance.with_inputs(solution, inputs)
         with timed({}, "assess"):
@@ -370,8 +367,9 @@ def do_nights(a):
     words = given(a, options.NIGHTS) | {"results": [each.rstrip("/") or each for each in a.results]}
     words["progress"] = wants_progress(a)
     found = legdistort.combine_nights(**words, workers=a.workers or min(parallel.n_cores(), len(a.results)))
+    picture = _picture(found, a)  # refused before the camera is written
     found.write(a.out, date=a.date, value=a.value, overwrite=a.overwrite)
-    _draw(found, a)
+    _write_picture(picture, a)
     asked = {"date": a.date, found.covariate: a.value}
     at = ", ".join(f"{name} {number:g}" for name, number in asked.items() if number is not None)
     at = f"\n\nThe camera in {a.out} is that of {at}." if at else ""
@@ -394,6 +392,20 @@ def do_stars(a):
     write_stars(solution, a.out, epoch=a.epoch, overwrite=a.overwrite)
     n_stars = len(solution.estimate.star_names)
     _say(a, f"{n_stars} stars in {a.out}", {"n_stars": n_stars, "out": str(a.out)})
+
+
+def do_camera(a):
+    """``legdistort camera``."""
+    solution = _solution(a)
+    camera, errors = solution.camera, solution.estimate.uncertainty.camera
+    if not camera.has_focal_plane:
+        raise InputError(
+            f"{a.solution} is of images without a focal plane: legdistort nights {a.solution} --out {a.out} writes "
+            "what it found of their static distortion"
+        )
+    camera.write(a.out, overwrite=a.overwrite)
+    unsettled = "; it did not settle (check camera), and its errors do not hold" if errors and errors.unsettled else ""
+    _say(a, f"{camera!r}"[1:-1] + f" in {a.out}{unsettled}", camera.to_dict())
 
 
 def do_correct(a):
@@ -485,24 +497,6 @@ def _open(a, **reading):
     return legdistort.open_exposures(**given(a, options.FRAMES, options.FLAGGED), **reading, progress=wants_progress(a))
 
 
-def _solving(a, matches=None):
-    """The arguments of `solve`; the prior read, no static distortion if there is none, with the widths asked for.
-
-    Without `matches`, of which the shape of the detector is known, those of `run`, which has the headers of its frames.
-    """
-    keywords = given(a, options.SOLVING)
-    static_sigma = keywords.pop("static_sigma", None)
-    sigma = keywords.pop("prior_sigma", None)
-    if matches is None and a.prior == HEADER:
-        return keywords | {"prior": HeaderPrior(sigma, static_sigma)}
-    shapes = set() if matches is None else set(matches.shapes.values())
-    prior = read_prior(a, usual_shape=shapes.pop() if len(shapes) == 1 else None)
-    if sigma is not None:
-        degree = 0 if sigma == EVIDENCE else HIGHEST if a.degree == AUTO else keywords.get("degree", DEGREE)
-        prior = (prior or legdistort.Prior([[0.0], [0.0]], source=UNSTATED)).with_sigma(sigma, degree=degree)
-    return keywords | {"prior": prior}
-
-
 def _measured_with(tables):
     """The camera that a run was given which left these tables; None if it was given none."""
     metas = [each.meta["camera"] for each in tables if each.meta.get("camera") is not None]
@@ -515,8 +509,17 @@ def _solution(a):
     return legdistort.Solution.read(a.solution, max_bytes=a.max_bytes)
 
 
+def _picture(result, a):
+    """The picture of a result, if it is asked for, not written yet."""
+    return None if a.plot is None else result.plot().figure
+
+
 def _draw(result, a):
-    """The picture of a result, if it is asked for."""
-    if a.plot is not None:
+    """Draw and write the picture of a result, if it is asked for."""
+    _write_picture(_picture(result, a), a)
+
+
+def _write_picture(figure, a):
+    if figure is not None:
         with outputs.replacing(a.plot, overwrite=a.overwrite) as file:
-            result.plot().figure.savefig(file, format=a.plot.suffix[1:].lower(), dpi=120)
+            figure.savefig(file, format=a.plot.suffix[1:].lower(), dpi=120)

@@ -14,11 +14,14 @@ from ..inputs import column_contract
 from ..inputs.exposure_names import left_out_by
 from ..inputs.table_files import read_table
 from ..priors.from_files import no_map
-from ..priors.prior import HEADER
+from ..priors.prior import EVIDENCE, HEADER, HeaderPrior
 from ..priors.storage import open_prior
 from ..runtime.asdf_files import entry_of
+from ..runtime.words import UNSTATED
+from ..solving.choices.degree_choice import AUTO, HIGHEST
+from ..solving.options import DEGREE
 from .arguments import given
-from .options import EXPANDING
+from .options import EXPANDING, SOLVING
 
 
 def refuse(given, reason):
@@ -101,6 +104,24 @@ def read_prior(a, usual_shape=None):
         return None if a.static_sigma is None else legdistort.Prior(None, static_sigma=a.static_sigma)
     with without_options_of_prior(a):
         return open_prior(text, legdistort.Prior, **known, usual_shape=usual_shape)
+
+
+def given_solving(a, matches=None):
+    """The arguments of `solve`; the prior read, no static distortion if there is none, with the widths asked for.
+
+    Without `matches`, of which the shape of the detector is known, those of `run`, which has the headers of its frames.
+    """
+    keywords = given(a, SOLVING)
+    static_sigma = keywords.pop("static_sigma", None)
+    sigma = keywords.pop("prior_sigma", None)
+    if matches is None and a.prior == HEADER:
+        return keywords | {"prior": HeaderPrior(sigma, static_sigma)}
+    shapes = set() if matches is None else set(matches.shapes.values())
+    prior = read_prior(a, usual_shape=shapes.pop() if len(shapes) == 1 else None)
+    if sigma is not None:
+        degree = 0 if sigma == EVIDENCE else HIGHEST if a.degree == AUTO else keywords.get("degree", DEGREE)
+        prior = (prior or legdistort.Prior([[0.0], [0.0]], source=UNSTATED)).with_sigma(sigma, degree=degree)
+    return keywords | {"prior": prior}
 
 
 def given_prior(a):

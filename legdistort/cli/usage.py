@@ -193,6 +193,12 @@ COMMANDS = {
         options.out("table (.ecsv, .fits, .vot, .xml, .csv, .txt or .dat)"),
         options.AT_EPOCH,
     ),
+    "camera": _command(
+        "the camera that a solution found as a file, to be shared",
+        "results/solution.asdf --out camera.asdf",
+        options.SOLUTION,
+        options.out("camera file (ASDF), for --camera"),
+    ),
     "correct": _command(
         "positions in its exposures to the reference plane and the sky, or any lists by a camera alone, with errors",
         "results/solution.asdf faint.ecsv --out corrected.ecsv",

@@ -253,6 +253,10 @@ def test_the_command(two, tmp_path, capsys):
     for i, each in enumerate(two):
         each.write(tmp_path / f"night{i}.asdf")
     first, whole = tmp_path / "first.asdf", tmp_path / "camera.asdf"
+    drawn_too = ["--out", str(first), "--plot", str(tmp_path / "a.png"), "--quiet"]
+    assert main(["nights", str(tmp_path / "night0.asdf"), *drawn_too]) == 1
+    assert "leave --plot out" in capsys.readouterr().err
+    assert not first.exists()
     assert main(["nights", str(tmp_path / "night0.asdf"), "--out", str(first), "--name", "PAIR", "--quiet"]) == 0
     assert main(["nights", str(first), str(tmp_path / "night1.asdf"), "--out", str(whole), "--quiet"]) == 0
     assert "detector axis x_degree" in capsys.readouterr().out

@@ -14,6 +14,7 @@ from astropy.table import Table
 from astropy.wcs import WCS
 
 import legdistort as ld
+from legdistort.cli import main
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis, detector_modes
 
@@ -148,6 +149,28 @@ def test_the_next_visit_comes_into_the_first(night, first, catalogue):
     scale, turn, left = off_sky(night, both)
     assert [scale, turn] == pytest.approx([0, 0], abs=1e-3)
     assert left**2 < 1.5 * np.mean(np.square([both.stars[name].value for name in ("x_err_abs", "y_err_abs")]))
+
+
+@pytest.mark.slow
+def test_the_shell_writes_the_camera_of_a_solution(night, first, tmp_path, capsys):
+    """All of it, of a visit that a reference tied and of one that had that camera; files are not replaced unasked."""
+    second = ld.solve(matched(night, 1, first.camera), prior=EVIDENCE)
+    assert second.estimate.uncertainty.camera.departure is not None  # it was known beforehand
+    for i, visited in enumerate([first, second]):
+        path, solved = tmp_path / f"{i}.asdf", visited.write(tmp_path / f"solved{i}.asdf")
+        assert main(["camera", str(solved), "--out", str(path), "--quiet"]) == 0
+        read, known = ld.Camera.read(path), visited.camera
+        assert list(read.detectors) == list(known.detectors)
+        assert capsys.readouterr().out.endswith(f"px in {path}\n")
+        for name in ("common_map", "common_sigma", "header_map", "place_errors"):
+            one, other = (np.array(getattr(each, name), dtype=float) for each in (read, known))  # None is nan
+            np.testing.assert_allclose(one, other, rtol=1e-12)
+        for key in known.detectors:
+            for name in ("layout", "layout_covariance", "static", "static_sigma"):
+                one, other = (np.array(getattr(each[key], name), dtype=float) for each in (read, known))
+                np.testing.assert_allclose(one, other, rtol=1e-12)
+    assert main(["camera", str(solved), "--out", str(path), "--quiet"]) == 1
+    assert "exists already; give --overwrite" in capsys.readouterr().err
 
 
 def test_the_errors_of_the_common_map_are_those_of_the_reference(first):

@@ -662,6 +662,7 @@ FILES = {
     "nights's plot": "nights IN --out elsewhere.asdf --plot OUT",
     "difference": "difference IN s.asdf --plot OUT",
     "stars": "stars IN --out OUT",
+    "camera": "camera IN --out OUT",
     "report": "report IN --out OUT",
 }
 FOLDERS = {
@@ -911,6 +912,13 @@ def test_writing_shows_a_bar_on_a_terminal(terminal, more, shown, demo, tmp_path
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     main(["solve", str(demo / "matched.ecsv"), "--out", str(tmp_path / "o"), *more])
     assert ("writing: 100%" in capsys.readouterr().err) == shown
+
+
+def test_the_camera_of_plain_images_is_none(demo, tmp_path, capsys):
+    out = tmp_path / "camera.asdf"
+    line = ["camera", str(demo / "solution.asdf"), "--out", str(out)]
+    failed(capsys, main(line), "images without a focal plane: legdistort nights", f"--out {out}")
+    assert not out.exists()
 
 
 def test_another_epoch_needs_motions(demo, tmp_path, capsys):

@@ -77,6 +77,7 @@ def test_detections_in_rows_and_columns_stay():
     assert np.mean(np.concatenate(still)) < 0.1
 
 
+@pytest.mark.slow
 def test_rows_without_weight_in_the_frames_are_left_out(tmp_path, capsys):
     """Two exposures: too few to see what stands still."""
     paths, rng = [], np.random.default_rng(4)
