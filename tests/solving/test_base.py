@@ -127,11 +127,18 @@ def test_a_size_of_the_static_distortion_stays():
     assert found.chi2 == given.chi2
 
 
-@pytest.mark.parametrize("sigma", [pytest.param("evidence", marks=pytest.mark.slow), 0.02])
-def test_the_scatter_of_exposures_stays(sigma):
+@pytest.mark.parametrize(
+    "known",
+    [
+        pytest.param(ld.Prior(None, sigma="evidence").with_sigma("evidence", degree=1), marks=pytest.mark.slow),
+        ld.Prior(None, sigma="evidence").with_sigma(0.02, degree=1),
+        ld.Prior(None, static_sigma=2.0, sigma=0.02),
+    ],
+    ids=["evidence", "scatter", "size and scatter"],
+)
+def test_the_widths_of_a_prior_stay(known):
     """Without a mean widths are all that there is to keep of a prior, as the command line has it for --prior-sigma."""
     old, new = parts(simulated(n=4, dynamic=0.02).matches.table, ["exp03"])
-    known = ld.Prior(None, sigma="evidence").with_sigma(sigma, degree=1)
     base = ld.solve(old, prior=known, degree=1, clip=None)
     found, given = ld.solve(new, base=base), ld.solve(new, base=base, prior=known)
     assert found.settings.prior == base.settings.prior

@@ -85,12 +85,10 @@ def _widths(settings):
     That is the size of a static distortion, or how far exposures scatter about one of which nothing is stated.
     """
     known = settings.prior or {}
-    if known.get("source") == UNSTATED:
-        mean = np.zeros((2, basis.n_modes(known["degree"])))
-        return Prior(mean, sigma=known["sigma"], source=UNSTATED)
-    if not known or known.get("degree", 0) is not None:  # by exposure or by detector there is none
+    if known.get("degree", 0) is not None and known.get("source") != UNSTATED:  # by exposure or by detector is none
         return None
-    return Prior(None, sigma=known["sigma"], static_sigma=known["static_sigma"])
+    mean = None if known["degree"] is None else np.zeros((2, basis.n_modes(known["degree"])))
+    return Prior(mean, sigma=known["sigma"], static_sigma=known["static_sigma"], source=known["source"])
 
 
 def _log(base, matches):
