@@ -25,6 +25,7 @@ from ...runtime import checks
 from .. import column_contract
 from ..plain_columns import is_text, numbers, text
 from ..table_files import read_table
+from .scamp import of_scamp
 
 #: How VizieR calls the columns of Gaia, and places in the tables of others, in small letters.
 VIZIER = {
@@ -254,7 +255,7 @@ def read_reference(reference, error=None, degree=None):
         label, table = "the reference", _exact(reference) if error is None else Table({"sky": reference})
     else:
         raise InputError(f"reference must be a table, the path of one, or a SkyCoord, got {type(reference).__name__}")
-    table = _named(_with_coordinates(table, label))
+    table = _named(of_scamp(_with_coordinates(table, label)))
     celestial = {"ra", "dec"} <= set(table.colnames)
     if not celestial and not {"x", "y"} <= set(table.colnames):
         raise InputError(
@@ -469,7 +470,9 @@ def _errors(table, values, unit, label):
     bad = ~(out > 0) & np.isfinite(out)
     if bad.any():
         row, k = np.argwhere(bad)[0]
-        raise InputError(f"{names[k]} must be positive, got {out[row, k]:g} in row {row}")
+        raise InputError(
+            f"{names[k]} must be positive, got {out[row, k]:g} in row {row}; one not known is NaN, or empty"
+        )
     return out
 
 
