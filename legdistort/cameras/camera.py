@@ -36,6 +36,7 @@ from .detector import Detector, Place
 from .from_wcs import camera_of, fullest, grid_of, header_map, moved_plane, stated_detectors
 from .header_layout import HeaderLayout, compare_headers
 from .source import check_shape
+from .stated_errors import joint_covariance
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -97,11 +98,17 @@ class Camera(ShownAsPrinted):
         Standard deviations of x, y [pix] and rotation [deg] of the `places` with the `common_map`, after one affine map
         of all detectors, with what layouts and map have in common; infinite where nothing is known. None: the errors of
         both count as independent.
+    covariance : array_like, shape (2 n_detectors n_modes, 2 n_detectors n_modes), optional
+        Covariance of layouts (orders 0 and 1) and static distortions of all detectors, one after the other, modes of x
+        first, px^2, as `legdistort.solve` finds it. Its diagonal are the squares of `layout_sigma` and `static_sigma`
+        of the detectors; where these have been changed since, it is left out (None). A prior has it for the next
+        exposures. None: all modes count as independent.
 
     Raises
     ------
     InputError
-        For no detector, detectors that lie on each other, or outside of the field; a `common_map` without its errors.
+        For no detector, detectors that lie on each other, or outside of the field; a `common_map` without its errors;
+        what is no covariance.
 
     See Also
     --------
@@ -127,6 +134,9 @@ class Camera(ShownAsPrinted):
     common_map: np.ndarray | None = stored(default=None, metadata=array(2, "modes", unit="pix"))
     header_map: np.ndarray | None = stored(default=None, metadata=array(2, 3, unit="pix", invertible=True))
     place_errors: np.ndarray | None = stored(default=None, metadata=array("n_chips", 3, minimum=0, infinite=True))
+    covariance: np.ndarray | None = stored(
+        default=None, metadata=array("k", "k", unit="pix2", covariance=True, infinite=True)
+    )
 
     def __post_init__(self) -> None:
         if not isinstance(self.detectors, dict) or not self.detectors:
@@ -143,6 +153,7 @@ class Camera(ShownAsPrinted):
         object.__setattr__(self, "common_sigma", _common(self.common_sigma))
         object.__setattr__(self, "common_map", _common_map(self.common_map, self.common_sigma))
         object.__setattr__(self, "place_errors", _place_errors(self.place_errors, len(detectors)))
+        object.__setattr__(self, "covariance", joint_covariance(self.covariance, list(detectors.values())))
         if self.header_map is not None:
             object.__setattr__(self, "header_map", similarity.check(self.header_map, "header_map"))
         if first.is_plain and not others and self.common_sigma is None and field == first.shape:

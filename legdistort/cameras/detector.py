@@ -69,10 +69,11 @@ class Detector(ShownAsPrinted):
         (`Camera.has_focal_plane`) it is not known at all without `static`.
     static_covariance : array_like, shape (2 n_modes, 2 n_modes), optional
         Covariance of `static`, modes of x first, px^2, in the place of `static_sigma`, which its diagonal becomes; that
-        of the Prior if one is given. What solves detectors of a focal plane takes their modes as independent.
+        of the Prior if one is given. What solves detectors of a focal plane takes their modes as independent, but for
+        those of a camera with a `Camera.covariance`.
     layout_covariance : array_like, shape (6, 6), optional
         Covariance of the modes of `layout_sigma`, those of x first, instead of it, px^2. It is for the errors of
-        `place`: as a prior they count as independent.
+        `place`: as a prior they count as independent, but for a `Camera.covariance`.
     header_layout : array_like, shape (2, 3), optional
         The layout as headers have it, in a plane of theirs that is the same for all detectors: it is compared with the
         layout, and what solves leaves it alone.

@@ -1,4 +1,7 @@
-"""Errors of static distortions as callers state them, widths or a covariance, and as they count in a solution."""
+"""Errors of static distortions as callers state them, widths or a covariance, and as they count in a solution.
+
+Also those of layouts and static distortions of all detectors of a camera together, as solutions find them.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -94,14 +97,14 @@ def as_errors(widths, covariance, n, names):
     return out, covariance
 
 
-def resized(covariance, n):
-    """A covariance (2 m, 2 m) for another number n of modes per axis, those beyond exact; None as None."""
+def resized(covariance, n, parts=2):
+    """A covariance of the modes of `parts` axes for another number n of each, those beyond exact; None as None."""
     if covariance is None:
         return None
-    m = len(covariance) // 2
-    out, kept = np.zeros((2, n, 2, n)), min(n, m)
-    out[:, :kept, :, :kept] = covariance.reshape(2, m, 2, m)[:, :kept, :, :kept]
-    return out.reshape(2 * n, 2 * n)
+    m = len(covariance) // parts
+    out, kept = np.zeros((parts, n, parts, n)), min(n, m)
+    out[:, :kept, :, :kept] = covariance.reshape(parts, m, parts, m)[:, :kept, :, :kept]
+    return out.reshape(parts * n, parts * n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,3 +211,103 @@ class StaticSpread:
         """V (n, K, K), nothing of what is not known."""
         known = np.where(np.isfinite(self.variance), self.variance, 0.0)
         return self.directions * known[:, None] @ self.directions.mT
+
+
+def joint_covariance(value, detectors):
+    """A covariance (2 n_detectors n, same) of all modes of detectors; None as None, and where their widths are others.
+
+    Raises
+    ------
+    InputError
+        For what is none.
+    """
+    if value is None:
+        return None
+    rows = 2 * len(detectors)
+    try:
+        n = len(value) // rows
+        basis.degree_of(n)
+    except (TypeError, ValueError):
+        n = 0
+    if n < 3 or len(value) != rows * n:
+        raise InputError(
+            f"covariance must be that of as many modes, 3 or more an axis, of each of {len(detectors)} detectors; for "
+            "other detectors than it was made for leave it out (covariance=None)"
+        )
+    out, widths = as_covariance(value, rows * n // 2, "covariance"), _widths(detectors, n)
+    same = widths is not None and np.allclose(np.sqrt(np.maximum(np.diag(out), 0)), widths.ravel(), rtol=1e-6, atol=0)
+    return out if same else None
+
+
+def _widths(detectors, n):
+    """Standard deviations (n_detectors, 2, n) of layouts and statics, exact ones 0; None if there are more modes."""
+    out = np.zeros((len(detectors), 2, n))
+    for k, each in enumerate(detectors):
+        for first, widths in ((0, each.layout_sigma), (3, each.static_sigma)):
+            if widths is None:
+                continue
+            if np.any(widths[:, n:]):
+                return None
+            known = widths[:, first:n]
+            out[k, :, first : first + known.shape[1]] = known
+    return out
+
+
+def errors_of(free, covariance):
+    """Standard deviations (n_detectors, 2, n_modes) of the free modes, of a covariance (k, k); zero for others."""
+    out = np.zeros(free.shape)
+    out[free] = np.sqrt(np.diag(covariance))
+    return out
+
+
+def with_errors(camera, free, covariance, unknown):
+    """The camera with the errors of its free modes, of a covariance (k, k), infinite along `unknown` directions (m, k).
+
+    Detectors of which nothing is free keep theirs.
+    """
+    errors, index = errors_of(free, covariance), np.full(free.shape, -1)
+    errors[free] = np.where(np.any(np.abs(unknown) > errors[free], axis=0), np.inf, errors[free])
+    index[free] = np.arange(np.count_nonzero(free))
+    detectors = {}
+    for k, (key, each) in enumerate(camera.detectors.items()):
+        detectors[key] = each
+        if not free[k].any():
+            continue
+        low, places = free[k, :, :3].ravel(), index[k, :, :3].ravel()
+        of_layout = np.zeros((6, 6))
+        of_layout[np.ix_(low, low)] = covariance[np.ix_(places[low], places[low])]
+        lost = np.isinf(errors[k, :, :3].ravel())
+        of_layout[lost] = of_layout[:, lost] = 0.0
+        of_layout[lost, lost] = np.inf
+        top = max(basis.degree_of(free.shape[2]), basis.degree_of(each.static.shape[1]))
+        widths = basis.change_degree(np.where(np.arange(free.shape[2]) < 3, 0.0, errors[k]), top)
+        static = basis.change_degree(each.static, top)
+        known = {"static_sigma": widths, "static_covariance": None}
+        detectors[key] = replace(each, layout_covariance=of_layout, static=static, **known)
+    return replace(camera, detectors=detectors, covariance=_of_all(detectors.values(), free, covariance))
+
+
+def _of_all(detectors, free, covariance):
+    """Covariance of all modes of detectors, of one (k, k) of the free ones; others are independent, by their widths."""
+    top = max([basis.degree_of(free.shape[2]), *(basis.degree_of(each.static.shape[1]) for each in detectors)])
+    widths = _widths(list(detectors), basis.n_modes(top))
+    rows = np.zeros(widths.shape, dtype=bool)
+    rows[:, :, : free.shape[2]] = free
+    known, rows = np.isfinite(widths[rows]), np.flatnonzero(rows)
+    out = np.diag(widths.ravel() ** 2)
+    out[np.ix_(rows[known], rows[known])] = covariance[np.ix_(known, known)]
+    return out
+
+
+def with_errors_times(camera, free, factor):
+    """The camera with the errors of what was fitted, `free` (n_detectors, 2, n_modes), times a factor."""
+    detectors, times = dict(camera.detectors), np.where(free.any(axis=(1, 2)), factor, 1.0)
+    for (key, each), fitted in zip(camera.detectors.items(), free, strict=True):
+        if fitted.any():
+            covariance, sigma = factor**2 * each.layout_covariance, factor * each.static_sigma
+            detectors[key] = replace(each, layout_covariance=covariance, static_sigma=sigma)
+    joint = camera.covariance
+    if joint is not None:
+        each = np.repeat(times, len(joint) // len(times))
+        joint = joint * np.outer(each, each)
+    return replace(camera, detectors=detectors, covariance=joint)

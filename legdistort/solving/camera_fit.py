@@ -12,11 +12,12 @@ where they are, which keeps the change of the camera as small as it can be.
 
 import warnings
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from ..cameras.detector import affine_of, moved_by
-from ..cameras.stated_errors import resized
+from ..cameras.stated_errors import errors_of, resized, with_errors
 from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, LegdistortError, SolveError, warn
 from ..geometry import basis, similarity
 from ..priors.prior import Prior
@@ -104,10 +105,13 @@ class Sought:
         Modes that are fitted; those of orders 0 and 1 are the layout.
     prior : ndarray, same shape
         Standard deviations beforehand; infinite where nothing is known.
+    covariance : ndarray, shape (n, n), or None
+        That of all modes beforehand, where it is known with what they have in common; else they are independent.
     """
 
     free: np.ndarray
     prior: np.ndarray
+    covariance: np.ndarray | None = None
 
     @classmethod
     def of(cls, matches, layout, static, degree):
@@ -143,7 +147,34 @@ class Sought:
                     prior[k, :, fitted] = padded[:, fitted]
             free[:, :, fitted] &= prior[:, :, fitted] > 0
         free[~seen] = False
-        return cls(free, prior) if free.any() else None
+        joint = resized(camera.covariance, modes, 2 * len(each))
+        return cls(free, prior, joint) if free.any() else None
+
+    @cached_property
+    def root(self):
+        """Free modes (k, r) by numbers that are independent beforehand: of unit size, or not known (see `stated`).
+
+        A change that the covariance beforehand leaves no room for is none of theirs.
+        """
+        widths = self.prior[self.free]
+        known = np.isfinite(widths)
+        if self.covariance is None:
+            return np.diag(np.where(known, widths, 1.0))
+        rows = np.flatnonzero(self.free)[known]
+        scaled = self.covariance[np.ix_(rows, rows)] / np.outer(widths[known], widths[known])
+        units = widths[known, None] * unit_errors(scaled)
+        return np.concatenate([np.eye(len(known))[:, known] @ units, np.eye(len(known))[:, ~known]], axis=1)
+
+    @property
+    def stated(self):
+        """Which of the numbers of `root` something is known of beforehand, bool (r,)."""
+        rows = np.isinf(self.prior[self.free])
+        return ~np.any(self.root[rows] != 0, axis=0)
+
+    @cached_property
+    def numbers(self):
+        """These numbers by changes of the free modes, (r, k)."""
+        return np.linalg.pinv(self.root)
 
     @property
     def of_common_map(self):
@@ -259,18 +290,18 @@ class CameraFit:
         With V of what was stated and C of what was found, ``C = (V^-1 + N^-1)^-1``, the departure of the two has the
         covariance V - C: what was stated tested by the exposures alone, whose covariance is N.
         """
-        stated = np.isfinite(self.sought.prior[self.sought.free])
+        free, stated = self.sought.free, np.isfinite(self.sought.prior[self.sought.free])
         if not stated.any():
             return None
-        sigma = self.sought.prior[self.sought.free][stated]
-        pull = self._departure[self.sought.free][stated] / sigma
-        left = np.eye(len(sigma)) - self.step.covariance[np.ix_(stated, stated)] / np.outer(sigma, sigma)
+        numbers = self.sought.numbers[self.sought.stated]
+        pull = numbers @ self._departure[free]
+        left = np.eye(len(numbers)) - numbers @ self.step.covariance @ numbers.T
         share, along = np.linalg.eigh(left)
         told = share > _TOLD
-        of_detector = np.argwhere(self.sought.free)[stated, 0]
-        most = np.argmax(np.bincount(of_detector, pull**2))
+        far = (self._departure[free][stated] / self.sought.prior[free][stated]) ** 2
+        most = np.argmax(np.bincount(np.argwhere(free)[stated, 0], far))
         chi2 = np.sum((along[:, told].T @ pull) ** 2 / share[told])
-        return Departure(len(sigma), float(chi2), float(np.count_nonzero(told)), list(camera.detectors)[most])
+        return Departure(len(numbers), float(chi2), float(np.count_nonzero(told)), list(camera.detectors)[most])
 
 
 def _beside(stated, found):
@@ -467,17 +498,18 @@ def camera_step(fit, sought, departure, stated=False):
     stated : ndarray of bool, shape (n_detectors,)
         Those whose headers nothing contradicts: what is not determined of them stays as these state it.
     """
-    free, prior = sought.free, sought.prior
+    free, root = sought.free, sought.root
     patterns = _patterns(fit.matches, fit.matches.camera, fit.weighted, free)
     follow = followed(response(fit.uncertainty.system, fit.result.gauge), fit.weighted, fit.blocks, patterns)
-    precision = 1 / prior[free] ** 2
+    precision, before = sought.stated.astype(float), sought.numbers @ departure[free]
     normal, pull = _told(fit, follow, free)
-    pull = pull - precision * departure[free]
-    covariance, weak = _inverse(normal, precision, follow.alone)
+    pull = root.T @ pull - precision * before
+    inverse, weak = _inverse(root.T @ normal @ root, precision, np.einsum("kr,kl,lr->r", root, follow.alone, root))
+    weak = weak @ root.T
     held = held_changes(weak, change_weights(free, stated), _slides(fit, free, weak))
     change = np.zeros(free.shape)
-    change[free] = held @ (departure[free] + covariance @ pull) - departure[free]
-    covariance = held @ covariance @ held.T
+    change[free] = held @ root @ (before + inverse @ pull) - departure[free]
+    covariance = held @ root @ inverse @ root.T @ held.T
     freedom = float(np.sum(covariance * normal))
     return CameraStep(change, covariance, free, follow.stars[:2], follow.coefficients, freedom, weak)
 
@@ -505,7 +537,7 @@ def _told(fit, follow, free):
     seen = np.isin(list(camera.detectors), camera.ids(fit.matches.table))
     if fit.result.gauge.poses_known or not free[seen][:, :, :3].all():
         return follow.normal, follow.pull
-    unit = 1 / np.sqrt(follow.alone)
+    unit = 1 / np.sqrt(np.diag(follow.alone))
     common = np.linalg.qr((exchanged_maps(camera, free, 1) / unit).T)[0]
     left = np.eye(len(unit)) - common @ common.T
     scaled = left @ (follow.normal * np.outer(unit, unit)) @ left
@@ -517,7 +549,7 @@ def _inverse(normal, precision, alone):
 
     `alone` (k,) is what the data would determine of each unknown if all others were known.
     """
-    unit = 1 / np.sqrt(alone)
+    unit = 1 / np.sqrt(alone + precision)
     values, vectors = np.linalg.eigh(normal * np.outer(unit, unit) + np.diag(precision > 0))
     good = values > _WEAK
     known = vectors[:, good] * unit[:, None]
@@ -588,47 +620,3 @@ def _widened(detector, degree):
     """Uncertainties of the static distortion of a detector with the modes of a degree, which it may not have had."""
     sigma = None if detector.static_sigma is None else basis.change_degree(detector.static_sigma, degree)
     return {"static_sigma": sigma, "static_covariance": resized(detector.static_covariance, basis.n_modes(degree))}
-
-
-def errors_of(free, covariance):
-    """Standard deviations (n_detectors, 2, n_modes) of the free modes, of a covariance (k, k); zero for others."""
-    out = np.zeros(free.shape)
-    out[free] = np.sqrt(np.diag(covariance))
-    return out
-
-
-def with_errors(camera, free, covariance, unknown):
-    """The camera with the errors of its free modes, of a covariance (k, k), infinite along `unknown` directions (m, k).
-
-    Detectors of which nothing is free keep theirs.
-    """
-    errors, index = errors_of(free, covariance), np.full(free.shape, -1)
-    errors[free] = np.where(np.any(np.abs(unknown) > errors[free], axis=0), np.inf, errors[free])
-    index[free] = np.arange(np.count_nonzero(free))
-    detectors = {}
-    for k, (key, each) in enumerate(camera.detectors.items()):
-        detectors[key] = each
-        if not free[k].any():
-            continue
-        low, places = free[k, :, :3].ravel(), index[k, :, :3].ravel()
-        of_layout = np.zeros((6, 6))
-        of_layout[np.ix_(low, low)] = covariance[np.ix_(places[low], places[low])]
-        lost = np.isinf(errors[k, :, :3].ravel())
-        of_layout[lost] = of_layout[:, lost] = 0.0
-        of_layout[lost, lost] = np.inf
-        top = max(basis.degree_of(free.shape[2]), basis.degree_of(each.static.shape[1]))
-        widths = basis.change_degree(np.where(np.arange(free.shape[2]) < 3, 0.0, errors[k]), top)
-        static = basis.change_degree(each.static, top)
-        known = {"static_sigma": widths, "static_covariance": None}
-        detectors[key] = replace(each, layout_covariance=of_layout, static=static, **known)
-    return replace(camera, detectors=detectors)
-
-
-def with_errors_times(camera, free, factor):
-    """The camera with the errors of what was fitted, `free` (n_detectors, 2, n_modes), times a factor."""
-    detectors = dict(camera.detectors)
-    for (key, each), fitted in zip(camera.detectors.items(), free, strict=True):
-        if fitted.any():
-            covariance, sigma = factor**2 * each.layout_covariance, factor * each.static_sigma
-            detectors[key] = replace(each, layout_covariance=covariance, static_sigma=sigma)
-    return replace(camera, detectors=detectors)

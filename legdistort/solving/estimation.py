@@ -13,6 +13,7 @@ import numpy as np
 
 from ..cameras import ties
 from ..cameras.exchanged import check_places
+from ..cameras.stated_errors import with_errors_times
 from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, SolveError, by_reason, some_of, warn
 from ..geometry import basis
 from ..matching.header_poses import header_map_by, sky_by_layout
@@ -27,7 +28,7 @@ from ..runtime.guards.units import plain_numbers
 from ..runtime.words import UNSTATED
 from . import minimisers, model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
-from .camera_fit import CameraFit, Sought, common_widths, held, with_declared_size, with_errors_times
+from .camera_fit import CameraFit, Sought, common_widths, held, with_declared_size
 from .checks.limits import ALIKE, MOST_NAMED
 from .choices import prior_widths
 from .choices.degree_choice import choose_degree

@@ -60,7 +60,11 @@ def camera():
     common = np.concatenate([np.zeros((2, 3)), np.full((2, 7), 0.05)], axis=1)
     known = {"common_map": 1e-3 * (common == 0), "header_map": [[1.0, -0.01, 3.0], [0.01, 1.0, -4.0]]}
     known["place_errors"] = [[0.1, 0.2, 0.003], [0.2, 0.1, 0.004]]
-    return Camera("pair", {"a": detector(10.0, 1), "b": detector(325.0, 2)}, FIELD, common, **known)
+    detectors = {"a": detector(10.0, 1), "b": detector(325.0, 2)}
+    widths = [np.concatenate([each.layout_sigma, each.static_sigma[:, 3:]], axis=1) for each in detectors.values()]
+    correlated = 0.9 * np.eye(40) + 0.1
+    known["covariance"] = correlated * np.outer(np.ravel(widths), np.ravel(widths))
+    return Camera("pair", detectors, FIELD, common, **known)
 
 
 def matches():
@@ -177,6 +181,7 @@ PLACES = {
     "detectors": "lie where the exposures show them",
     "common_sigma": "counts what was fitted",
     "place_errors": "are those of places found anew",
+    "covariance": "is that of what was found",
     "header_map": "has the focal plane where the exposures show it",
 }
 

@@ -8,12 +8,12 @@ from astropy.table import vstack
 
 from ...cameras.camera import Camera
 from ...cameras.detector import Detector
-from ...cameras.stated_errors import UNKNOWN
+from ...cameras.stated_errors import UNKNOWN, with_errors
 from ...exceptions import InputError
 from ...geometry import basis, detector_modes, similarity
 from ...priors.mode_tables import mode_table
 from ...results.errors.common_distortion import NOTHING
-from ...solving.camera_fit import change_weights, changed, exchanged_maps, held_changes, with_errors
+from ...solving.camera_fit import change_weights, changed, exchanged_maps, held_changes
 
 #: Variance [pix^2] of a direction in which a solution was held rather than determined: no error is so small.
 _HELD = 1e-10
@@ -145,7 +145,8 @@ class CameraChanges:
         """The camera after changes (n_detectors, 2, n) with their covariance (K, K), infinite where it is not known."""
         sizes, directions = np.linalg.eigh(covariance)
         unknown = sizes > UNKNOWN**2
-        covariance = (directions[:, ~unknown] * sizes[~unknown]) @ directions[:, ~unknown].T
+        known = np.maximum(sizes[~unknown], 0)  # maps of the focal plane have none but for rounding
+        covariance = (directions[:, ~unknown] * known) @ directions[:, ~unknown].T
         size = np.sqrt(np.mean(directions[:, unknown] ** 2, axis=0))
         camera = with_errors(changed(self.camera, mean), self.free, covariance, (directions[:, unknown] / size).T)
         detectors = {}

@@ -22,8 +22,8 @@ class Followed:
         How the fitted coefficients follow.
     normal : ndarray, shape (k, k)
         Normal matrix of these numbers with stars and coefficients eliminated.
-    alone : ndarray, shape (k,)
-        Its diagonal if stars and coefficients were known.
+    alone : ndarray, shape (k, k)
+        The same if stars and coefficients were known.
     pull : ndarray, shape (k,)
         Minus half the slope of chi2.
     """
@@ -49,7 +49,7 @@ def followed(respond, problem, blocks, patterns):
     """
     moved, k = _weighted(problem, patterns), patterns.shape[2]
     normal = np.tensordot(patterns, moved, ((0, 1), (0, 1)))
-    alone = np.diag(normal).copy()
+    alone = normal.copy()
     stars = np.empty((*blocks.g_star.shape, k))
     coefficients = np.empty((*blocks.g_exposure.shape, k))
     gradients = [_gradient(problem, blocks, patterns[:, :, j], moved[:, :, j]) for j in range(k)]
