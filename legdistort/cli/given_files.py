@@ -12,7 +12,8 @@ from ..coaddition.grids import given_grid, read_grid
 from ..exceptions import InputError
 from ..inputs import column_contract
 from ..inputs.exposure_names import left_out_by
-from ..inputs.table_files import read_table
+from ..inputs.star_lists.given_dates import read_dates, with_dates
+from ..inputs.table_files import read_table, told_apart
 from ..priors.from_files import no_map
 from ..priors.prior import EVIDENCE, HEADER, HeaderPrior
 from ..priors.storage import open_prior
@@ -45,6 +46,12 @@ def read_given(path, a, contract=None):
     if contract is not None and len(table):
         column_contract.check(table, contract, str(path))
     return table
+
+
+def read_lists(a, contract):
+    """The tables of a command line by file, with names of exposures that differ, and the dates of ``--dates``."""
+    read = told_apart([(Path(path), read_given(path, a, contract)) for path in a.tables])
+    return read if a.dates is None else with_dates(read, read_dates(a.dates), a.dates)
 
 
 def given_camera(given):
