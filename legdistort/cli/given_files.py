@@ -1,9 +1,12 @@
 """What is given on the command line: tables, cameras, priors, grids, matched positions, sized terms."""
 
+import logging
 import re
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 import legdistort
 
@@ -23,6 +26,8 @@ from ..solving.choices.degree_choice import AUTO, HIGHEST
 from ..solving.options import DEGREE
 from .arguments import given
 from .options import EXPANDING, SOLVING
+
+log = logging.getLogger(__name__)
 
 
 def refuse(given, reason):
@@ -51,6 +56,11 @@ def read_given(path, a, contract=None):
 def read_lists(a, contract):
     """The tables of a command line by file, with names of exposures that differ, and the dates of ``--dates``."""
     read = told_apart([(Path(path), read_given(path, a, contract)) for path in a.tables])
+    filled = [
+        bool(len(table)) and bool((np.asarray(table["x_err"]) == a.error).all()) for table in read.values() if a.error
+    ]
+    if 0 < sum(filled) < len(filled):
+        log.info("these are %d of %d lists", sum(filled), len(filled))
     return read if a.dates is None else with_dates(read, read_dates(a.dates), a.dates)
 
 

@@ -257,8 +257,8 @@ def _fill_errors(table, error):
         table[name] = np.where(bad, error, stated) * u.pix
         filled |= bad
     if filled.any():  # in the same words of every list, which are said once
-        words = "all" if filled.all() else "some"
-        log.info("%s positions come without an error; it is taken as %g pixels", words, error)
+        words = "all positions of a list" if filled.all() else "some positions of a list"
+        log.info("where %s come without an error, it is taken as %g pixels", words, error)
 
 
 def write_stars(solution, path, *, epoch=None, overwrite=False):

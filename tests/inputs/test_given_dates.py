@@ -93,3 +93,19 @@ def test_match_takes_dates(tmp_path, capsys):
     capsys.readouterr()
     assert main(["solve", str(tmp_path / "plain.ecsv"), "--motion", "proper", "--out", str(tmp_path / "o")]) == 1
     assert "legdistort match --dates TABLE, which has names of lists and their dates" in capsys.readouterr().err
+
+
+def test_the_number_of_lists_without_errors_is_told(tmp_path, caplog):
+    """Not that all positions come without one, which is true of some lists."""
+    from legdistort.cli import given_files, parser
+
+    caplog.set_level("INFO", logger="legdistort")
+    for name, more in (("a", ""), ("b", ",x_err,y_err"), ("c", ""), ("d", ",x_err,y_err")):
+        (tmp_path / f"{name}.csv").write_text(f"x,y{more}\n1.0,2.0{',0.1,0.1' if more else ''}\n")
+    lists = sorted(map(str, tmp_path.glob("*.csv")))
+    given_files.read_lists(parser._parsed(["match", *lists, "--error", "0.02", "--out", "m.ecsv"]), None)
+    assert "where all positions of a list come without an error, it is taken as 0.02 pixels" in caplog.text
+    assert "these are 2 of 4 lists" in caplog.text
+    caplog.clear()
+    given_files.read_lists(parser._parsed(["match", *lists[::2], "--error", "0.02", "--out", "m.ecsv"]), None)
+    assert "these are" not in caplog.text

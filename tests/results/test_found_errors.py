@@ -262,6 +262,35 @@ def test_positions_without_a_flux_keep_their_errors_with_a_warning(plain):
         plain[name].correct(PIXELS, errors=0.03, flux=np.nan)
 
 
+def test_lists_without_errors_have_those_of_the_law(plain):
+    """Where they have a flux or magnitude; else another error is asked for, and nothing is said of solve."""
+    solution = finding(plain, error_law=ErrorLaw(3.0, 0.2, 0.005, {plain.names[0]: 2.0}, {plain.names[0]: 10.0}))
+    table = QTable({"exposure": [plain.names[0]] * 4, "mag": -2.5 * np.log10([100.0, 1e3, 1e4, 1e5])})
+    table["x"], table["y"] = PIXELS.T * u.pix
+    flux = 10 * np.array([100.0, 1e3, 1e4, 1e5])
+    sigma = 2 * np.sqrt((3.0 / flux) ** 2 + 0.2**2 / flux + 0.005**2)
+    found = solution.correct_table(table)
+    stated = table.copy()
+    stated["x_err"] = stated["y_err"] = sigma * u.pix
+    expected = finding(plain).correct_table(stated)
+    for name in ("x_err", "y_err", "x_err_abs"):
+        assert_allclose(found[name].value, expected[name].value)
+    some = stated.copy()
+    some["x_err"][1] = np.nan * u.pix
+    assert_allclose(solution.correct_table(some)["x_err"].value, expected["x_err"].value)
+    table.remove_column("mag")
+    with pytest.raises(
+        InputError, match=r"lacks the columns x_err, y_err; .*--error PIXELS, or a column flux or mag: "
+    ):
+        solution.correct_table(table)
+    with pytest.raises(InputError, match=r"lacks the columns x_err, y_err; .* or --error PIXELS\)$"):
+        plain.correct_table(table)
+    stated["mag"] = [10.0, 99.0, 99.0, 10.0]
+    stated.remove_columns(["x_err", "y_err"])
+    with pytest.raises(InputError, match="x_err is not a positive finite number in 2 of 4 rows"):
+        solution.correct_table(stated)
+
+
 def test_bad_fluxes_are_named(plain):
     name = plain.names[0]
     for flux in ([1.0, 2.0], "bright", np.ones((4, 2))):
