@@ -1,6 +1,7 @@
 """Dates of star lists by a table of them: as a user has it."""
 
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from astropy.table import Column, Table
 from numpy.testing import assert_allclose, assert_array_equal
 
 from legdistort.cli import main
-from legdistort.exceptions import InputError
+from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs import column_contract
 from legdistort.inputs.star_lists.given_dates import read_dates, with_dates
 
@@ -109,3 +110,20 @@ def test_the_number_of_lists_without_errors_is_told(tmp_path, caplog):
     caplog.clear()
     given_files.read_lists(parser._parsed(["match", *lists[::2], "--error", "0.02", "--out", "m.ecsv"]), None)
     assert "these are" not in caplog.text
+
+
+def test_columns_that_are_no_errors_are_named(tmp_path):
+    """Of lists of two widths, column 6 has errors in one kind and the ratio of signal to noise in the other."""
+    from legdistort.cli import given_files, parser
+
+    for name, error in (("a", 0.02), ("b", 36.0), ("c", 0.01)):
+        rows = "".join(f"{k} 1.0 2.0 {k + 5} {k + 7} {error}\n" for k in range(9))
+        (tmp_path / f"{name}.lis").write_text(rows)
+    lists = sorted(map(str, tmp_path.glob("*.lis")))
+    columns = ["--columns", "x=col4,y=col5,x_err=col6,y_err=col6"]
+    words = r"larger than 5 pixels in the median in 1 of 3 lists \(.*b\.lis: 36\): if another column"
+    with pytest.warns(AssumptionWarning, match=words):
+        given_files.read_lists(parser._parsed(["match", *lists, *columns, "--out", "m.ecsv"]), None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        given_files.read_lists(parser._parsed(["match", *lists[::2], *columns, "--out", "m.ecsv"]), None)
