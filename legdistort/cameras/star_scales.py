@@ -78,6 +78,16 @@ def star_scales(exposure, detector, star, flux, n_exposures, n_detectors=1):
     return StarScales(values, errors, *of_detectors, n_stars=len(stars))
 
 
+def flux_levels(exposure, star, flux, n_exposures, detector=None):
+    """Factors (n_exposures,) that bring the fluxes of exposures to a common level, by their common stars.
+
+    They are 1 where these do not join all exposures.
+    """
+    detector = np.zeros(len(exposure), dtype=int) if detector is None else detector
+    found = star_scales(exposure, detector, star, flux, n_exposures, detector.max(initial=0) + 1)
+    return np.ones(n_exposures) if found is None else np.exp(found.exposures)
+
+
 @dataclass(frozen=True, eq=False)
 class FluxFactors:
     """Factors by name: of exposures, and of the detectors of a camera.

@@ -17,7 +17,7 @@ from ..exceptions import InputError
 from ..inputs import column_contract
 from ..inputs.detector_files import warn_of_detectors
 from ..inputs.star_lists.formats import stack
-from ..inputs.table_files import named_after, named_as_known, names_of_images, records, told_apart, write_stars
+from ..inputs.table_files import named_after, named_as_known, names_of_images, records, write_stars
 from ..results.check import WRONG, Check, worst
 from ..runtime import outputs, parallel, provenance
 from ..runtime.trees.codec import from_tree
@@ -30,6 +30,7 @@ from .given_files import (
     grid_in,
     known_file,
     read_given,
+    read_lists,
     read_matches,
     read_prior,
     refuse,
@@ -153,7 +154,7 @@ def do_match(a):
     from ..pipeline import timed, write_matched
 
     contract = column_contract.DETECTED | {name: column_contract.MATCHED[name] for name in ("epoch", "block")}
-    read = told_apart([(Path(path), read_given(path, a, contract)) for path in a.tables])
+    read = read_lists(a, contract)
     camera = given_camera(a.camera) or _measured_with(read.values())
     if a.wcs is None:
         refuse({"ext": a.ext} | given(a, options.FLAGGED), "is for the frames of --wcs")

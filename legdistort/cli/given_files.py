@@ -1,18 +1,23 @@
 """What is given on the command line: tables, cameras, priors, grids, matched positions, sized terms."""
 
+import logging
 import re
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from astropy import units as u
+
 import legdistort
 
 from ..assessment.nights.night_data import EXACT
 from ..coaddition.grids import given_grid, read_grid
-from ..exceptions import InputError
+from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..inputs import column_contract
 from ..inputs.exposure_names import left_out_by
-from ..inputs.table_files import read_table
+from ..inputs.star_lists.given_dates import read_dates, with_dates
+from ..inputs.table_files import read_table, told_apart
 from ..priors.from_files import no_map
 from ..priors.prior import EVIDENCE, HEADER, HeaderPrior
 from ..priors.storage import open_prior
@@ -22,6 +27,11 @@ from ..solving.choices.degree_choice import AUTO, HIGHEST
 from ..solving.options import DEGREE
 from .arguments import given
 from .options import EXPANDING, SOLVING
+
+log = logging.getLogger(__name__)
+
+#: Median error of positions [pix] that none have: the column is another.
+LARGE = 5.0
 
 
 def refuse(given, reason):
@@ -45,6 +55,34 @@ def read_given(path, a, contract=None):
     if contract is not None and len(table):
         column_contract.check(table, contract, str(path))
     return table
+
+
+def read_lists(a, contract):
+    """The tables of a command line by file, with names of exposures that differ, and the dates of ``--dates``."""
+    read = told_apart([(Path(path), read_given(path, a, contract)) for path in a.tables])
+    filled = [a.error is not None and len(table) and np.all(_errors(table) == a.error) for table in read.values()]
+    if 0 < sum(filled) < len(filled):
+        log.info("these are %d of %d lists", sum(filled), len(filled))
+    _warn_of_large_errors(read)
+    return read if a.dates is None else with_dates(read, read_dates(a.dates), a.dates)
+
+
+def _errors(table):
+    """Errors of the positions of a table (2, n), pixels."""
+    return np.array([column_contract.values(table, name, u.pix) for name in ("x_err", "y_err")])
+
+
+def _warn_of_large_errors(read):
+    """Warn of tables, ``{path: table}``, whose errors are none: lists of another width have another column there."""
+    errors = {path: float(np.median(_errors(table))) for path, table in read.items() if len(table)}
+    if large := {str(path): error for path, error in errors.items() if error > LARGE}:
+        named = some_of([f"{path}: {error:.3g}" for path, error in large.items()], 6)
+        warn(
+            f"errors of positions are larger than {LARGE:g} pixels in the median in {len(large)} of {len(read)} lists "
+            f"({named}): if another column stands where x_err and y_err are taken from, as in lists that have fewer "
+            "columns, name it for these apart (--columns), or give an error (--error)",
+            AssumptionWarning,
+        )
 
 
 def given_camera(given):

@@ -87,6 +87,7 @@ TABLES = {
 }
 WCS_OF_TABLES = {
     "wcs": Option("frames of the tables: WCS, shape and time", nargs="+", metavar="FRAME", path="inputs"),
+    "dates": Option("when lists were taken: their names, and years, MJD or dates", metavar="TABLE", path="read"),
     "ext": Option("extension of those frames: number, name, or NAME,VERSION", type=extension),
 }
 OF_STATIC = {
@@ -231,8 +232,7 @@ INJECTING = {
 }
 CAMERA = {
     "camera": Option(
-        "of exposures with several detectors: a camera file, results that found one, or gsaoi (default: by "
-        "the headers)",
+        "of exposures with several detectors: a camera file, results that found one, or gsaoi (default: headers)",
         metavar="CAMERA",
     )
 }

@@ -290,10 +290,9 @@ _RULES = (
 #: Description of a column `exposure` that the file of a table does not have.
 OF_FILE = "name of the file"
 _UNMATCHED = "find out first which positions are of the same star: match(table) (legdistort match); "
-_NO_ERRORS = (
-    "; where a list has no errors, give one for all, read_table(error=...) or --error PIXELS, and let solve find them "
-    "with errors='by-brightness')"
-)
+#: What to do without errors of positions, and what `legdistort.solve` does then.
+GIVE_ERRORS = "; where a list has no errors, give one for all, read_table(error=...) or --error PIXELS"
+_FOUND = ", and let solve find them with errors='by-brightness'"
 
 
 def _check_values(table, what):
@@ -325,7 +324,7 @@ def as_table(table, what):
     return made
 
 
-def check(table, contract, what):
+def check(table, contract, what, without_errors=GIVE_ERRORS + _FOUND):
     """Check a table against a column contract and return it as a `~astropy.table.QTable`.
 
     Columns beyond the contract are kept; of magnitudes fluxes are made where there are none. Positions must be finite,
@@ -338,6 +337,8 @@ def check(table, contract, what):
         `MATCHED` or `DETECTED`.
     what : str
         How messages call the table.
+    without_errors : str
+        What they advise where there are no errors of positions.
 
     Raises
     ------
@@ -352,7 +353,8 @@ def check(table, contract, what):
             f"{what} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
             + _UNMATCHED * ("star" in missing)
             + f"it has {', '.join(present)} (map names: columns={{'{missing[0]}': ...}} or --columns {missing[0]}=..."
-            + (_NO_ERRORS if {"x_err", "y_err"} & set(missing) else ")")
+            + without_errors * bool({"x_err", "y_err"} & set(missing))
+            + ")"
         )
     if len(table) == 0:
         needed = f" the columns {', '.join(missing)} and" if missing else ""
@@ -367,6 +369,13 @@ def check(table, contract, what):
         out["flux"] = flux_of(out["mag"])
     _check_values(out, what)
     return out
+
+
+def fluxes(table):
+    """Fluxes of the rows of a table (n,), NaN where there is none, by its column ``flux`` or ``mag``; None without."""
+    if "flux" in table.colnames:
+        return values(_in_fluxes(table, DETECTED), "flux")
+    return flux_of(values(table, "mag")) if "mag" in table.colnames else None
 
 
 def _in_fluxes(table, contract):

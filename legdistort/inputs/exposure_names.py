@@ -24,6 +24,12 @@ def exposure_name(path, ext=None):
     return name if ext is None else f"{name}_{''.join(map(str, parts))}"
 
 
+def list_name(path):
+    """What the exposure of a list is called, by the name of its file."""
+    path = Path(path)
+    return exposure_name(Path(path.stem).stem if path.suffix.lower() in (".gz", ".bz2") else path.stem)
+
+
 def folder_marks(names, paths):
     """What comes before names of files in several folders so that those of one name differ: ``FOLDER_``.
 

@@ -135,7 +135,7 @@ def told_apart(tables):
         if (first := real.setdefault(path.resolve(), path)) is not path:
             raise InputError(f"{first} and {path} are one file: give it once")
     of_file = [path for path, table in tables if _is_of_file(table)]
-    names = list(map(_name_of, of_file))
+    names = list(map(exposure_names.list_name, of_file))
     marks = dict(zip(of_file, exposure_names.folder_marks(names, of_file), strict=True))
     if any(marks.values()):
         log.info("%s", exposure_names.folders_in_words(marks[of_file[0]] + names[0]))
@@ -188,9 +188,9 @@ def named_as_known(table, path, known):
     known : iterable of str
     """
     path = Path(path)
-    return (
-        with_mark(table, exposure_names.folder_mark(_name_of(path), path, known), path) if _is_of_file(table) else table
-    )
+    if not _is_of_file(table):
+        return table
+    return with_mark(table, exposure_names.folder_mark(exposure_names.list_name(path), path, known), path)
 
 
 def _is_of_file(table):
@@ -205,12 +205,6 @@ def _images_of(table):
     return list(dict.fromkeys(exposure_names.detector_name(*pair) for pair in pairs))
 
 
-def _name_of(path):
-    """What the exposure of a list is called, by the name of the file."""
-    stem = Path(path.stem).stem if path.suffix.lower() in (".gz", ".bz2") else path.stem
-    return exposure_names.exposure_name(stem)
-
-
 def _frame_of(name, frames):
     """The longest name of a frame that a name begins with, or the only one that differs by its last word; or None."""
     begins = [frame for frame in frames if re.match(rf"{re.escape(frame)}(?![A-Za-z0-9])", str(name))]
@@ -222,7 +216,7 @@ def _united(parts, path):
     shapes = {}
     for number, table in parts.items():
         if "exposure" not in table.colnames:
-            name = _name_of(path) + (f"_{number}" if number is not None else "")
+            name = exposure_names.list_name(path) + (f"_{number}" if number is not None else "")
             exposure_names.check_exposure_name(name, path)
             table["exposure"] = Column(np.full(len(table), name), description=column_contract.OF_FILE)
             if "shape" in table.meta:
@@ -263,8 +257,8 @@ def _fill_errors(table, error):
         table[name] = np.where(bad, error, stated) * u.pix
         filled |= bad
     if filled.any():  # in the same words of every list, which are said once
-        words = "all" if filled.all() else "some"
-        log.info("%s positions come without an error; it is taken as %g pixels", words, error)
+        words = "all positions of a list" if filled.all() else "some positions of a list"
+        log.info("where %s come without an error, it is taken as %g pixels", words, error)
 
 
 def write_stars(solution, path, *, epoch=None, overwrite=False):

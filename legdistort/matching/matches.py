@@ -283,8 +283,9 @@ class Matches(ShownAsPrinted):
         """
         if "epoch" not in self.table.colnames:
             raise InputError(
-                "when the exposures were taken is not known: give the column epoch (decimal years, MJD or Time), or "
-                "frames with DATE-OBS, MJD-OBS or EXPSTART in their headers"
+                "when the exposures were taken is not known: give the column epoch (decimal years, MJD or Time), "
+                "frames with DATE-OBS, MJD-OBS or EXPSTART in their headers, or legdistort match --dates TABLE, which "
+                "has names of lists and their dates"
             )
         return exposure_years(self.names, self.observations.exposure, column_contract.values(self.table, "epoch", u.yr))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +25,11 @@ MOVING = 6.6
 
 #: Fits of a law of errors one after the other, each with the weights of that before.
 _ROUNDS = 20
+#: Law and factors of exposures are found in turn. An exposure counts as if so many of its stars scattered as those of
+#: the others: its factor is known as well as 10 %.
+_SWEEPS, _COMMON_STARS = 5, 20
+#: Logarithm of the likelihood that fluxes at a common level must gain over those as they are.
+_GAIN = 3.0
 
 _MOST_NAMED = 6
 _COUNT, _SCALE, _PIXELS = number(minimum=0), number(minimum=0), number(minimum=0, unit="pix")
@@ -146,15 +151,19 @@ class ErrorLaw:
     Attributes
     ----------
     a, b, floor : float
-        Pixels, in units of the flux of the observations.
+        Pixels, in units of the flux of the observations, at the common level where there is one.
     factors : dict
         ``{exposure: factor}``.
+    levels : dict
+        ``{exposure: factor}`` that brings its fluxes to the level that all exposures have in common; empty where the
+        law holds for the fluxes as they are.
     """
 
     a: float = field(metadata=_PIXELS)
     b: float = field(metadata=_PIXELS)
     floor: float = field(metadata=_PIXELS)
     factors: dict[str, float] = field(metadata=_SCALE)
+    levels: dict[str, float] = field(default_factory=dict, metadata=_SCALE)
 
     @classmethod
     def of(cls, flux: ArrayLike, variance: ArrayLike, factors: dict[str, float] | None = None) -> ErrorLaw:
@@ -172,13 +181,57 @@ class ErrorLaw:
             model = np.maximum(terms @ size, 1e-6 * np.mean(variance))
         return cls(*map(float, np.sqrt(size)), factors or {})
 
+    @classmethod
+    def likelier(
+        cls, flux: np.ndarray, variance: np.ndarray, exposure: np.ndarray, levels: np.ndarray
+    ) -> tuple[ErrorLaw, np.ndarray, np.ndarray]:
+        """The law of measured variances (n,), of fluxes as they are or at their common level, whichever is likelier.
+
+        Counts tell errors as they are, of short exposures too; magnitudes of lists with zero points of their own do
+        once they are at one level.
+
+        Parameters
+        ----------
+        flux, variance : ndarray, shape (n,)
+            Rows without a flux get that of the faintest. Pixels^2.
+        exposure : ndarray of int, shape (n,)
+        levels : ndarray, shape (n_exposures,)
+            Factors that bring the fluxes of exposures to a common level.
+
+        Returns
+        -------
+        ErrorLaw
+            Of the average exposure.
+        factor, level : ndarray, shape (n_exposures,)
+            On the errors of an exposure, and on its fluxes: 1 where these count as they are.
+        """
+        count, found = np.bincount(exposure, minlength=len(levels)), []
+        for level in (np.ones(len(levels)), levels):
+            at_level, factor = filled(flux, level[exposure]) * level[exposure], np.ones(len(levels))
+            for _ in range(_SWEEPS):
+                law = cls.of(at_level, variance / factor[exposure] ** 2)
+                own = law.sigma(at_level) ** 2
+                ratio = np.bincount(exposure, variance / own, len(levels))
+                factor = np.sqrt((ratio + _COMMON_STARS) / (count + _COMMON_STARS))
+            model = factor[exposure] ** 2 * own
+            found.append((np.sum(np.log(model) + variance / model), law, factor, level))
+        as_they_are, at_one_level = found
+        return (at_one_level if at_one_level[0] < as_they_are[0] - _GAIN else as_they_are)[1:]
+
     def sigma(self, flux: ArrayLike, exposure: ArrayLike | None = None) -> np.ndarray:
-        """Error [pix] of positions with a flux (n,), in the exposures named (n,); by default of the average one."""
-        flux = np.asarray(flux, dtype=float)
-        sigma = np.sqrt((self.a / flux) ** 2 + self.b**2 / flux + self.floor**2)
-        if exposure is None:
-            return sigma
-        return sigma * np.array([self.factors.get(name, 1.0) for name in np.asarray(exposure).tolist()])
+        """Error [pix] of positions with a flux (n,), in the exposures named (n,).
+
+        By default in the average exposure, of fluxes at the common level.
+        """
+        flux, factor = np.asarray(flux, dtype=float), 1.0
+        if exposure is not None:
+            factor = np.array([self.factors.get(name, 1.0) for name in np.asarray(exposure).tolist()])
+            flux = self.at_level(flux, exposure)
+        return factor * np.sqrt((self.a / flux) ** 2 + self.b**2 / flux + self.floor**2)
+
+    def at_level(self, flux: ArrayLike, exposure: ArrayLike) -> np.ndarray:
+        """Fluxes (n,) of the exposures named (n,), brought to the level of the law."""
+        return np.asarray(flux, dtype=float) * [self.levels.get(name, 1.0) for name in np.asarray(exposure).tolist()]
 
     def knows(self, flux: ArrayLike) -> np.ndarray:
         """Of which positions the law gives errors: those with a positive flux, (n,) of bool."""
@@ -187,14 +240,21 @@ class ErrorLaw:
 
     def scaled(self, factor: float) -> ErrorLaw:
         """The law with all errors multiplied."""
-        return ErrorLaw(self.a * factor, self.b * factor, self.floor * factor, self.factors)
+        return replace(self, a=self.a * factor, b=self.b * factor, floor=self.floor * factor)
 
     def __str__(self) -> str:
-        factors = list(self.factors.values())
+        factors, levels = list(self.factors.values()), list(self.levels.values())
+        of = f"; fluxes times {min(levels):.3g} to {max(levels):.3g} by exposure, by common stars" if levels else ""
         return (
             f"by brightness, from the scatter of the stars: sqrt(({self.a:.4g} / flux)^2 + {self.b:.4g}^2 / flux + "
-            f"{self.floor:.4g}^2) px, times {min(factors):.2f} to {max(factors):.2f} by exposure"
+            f"{self.floor:.4g}^2) px, times {min(factors):.2f} to {max(factors):.2f} by exposure{of}"
         )
+
+
+def filled(flux: np.ndarray, level: np.ndarray | float) -> np.ndarray:
+    """Fluxes (n,) of which those that are missing are that of the faintest, once they are multiplied by a level."""
+    known = np.isfinite(flux) & (flux > 0)
+    return np.where(known, flux, (flux * level)[known].min() / level)
 
 
 #: Polynomials that times ``exp(-u)`` are the correlation of processes with 0, 1 and 2 derivatives, and where it is 1/e.

@@ -296,7 +296,7 @@ def widened_all(motion, degree):
 
 def correct_table(solution, table, epoch=None):
     """`Solution.correct_table`; see there."""
-    table = column_contract.check(table, column_contract.DETECTED, "the table of positions")
+    table = column_contract.check(*_with_law(solution.diagnostics.error_law, table))
     table = solution.camera.in_focal_plane(table)
     if epoch is not None:
         fitted(solution.estimate.motions)
@@ -327,6 +327,24 @@ def correct_table(solution, table, epoch=None):
     if epoch is not None:
         out.meta["epoch"] = year(epoch)
     return column_contract.describe_stars(out)
+
+
+def _with_law(law, table):
+    """What `column_contract.check` takes of a table of positions: those without an error get that of a law, if any."""
+    what, advice = "the table of positions", column_contract.GIVE_ERRORS
+    table = column_contract.as_table(table, what)
+    flux = None if law is None else column_contract.fluxes(table)
+    if law is not None and flux is None:
+        advice += ", or a column flux or mag: errors of the solution follow a law of brightness"
+    if flux is not None and "exposure" in table.colnames:
+        table, known = table.copy(), law.knows(flux)
+        sigma = law.sigma(np.where(known, flux, 1.0), column_contract.labels(table, "exposure"))
+        for name in ("x_err", "y_err"):
+            given = (
+                column_contract.values(table, name, u.pix) if name in table.colnames else np.full(len(table), np.nan)
+            )
+            table[name] = np.where(known & ~(np.isfinite(given) & (given > 0)), sigma, given) * u.pix
+    return table, column_contract.DETECTED, what, advice
 
 
 def _stars_of(solution, table, pixels):

@@ -182,6 +182,24 @@ def test_starfinder_without_a_header(tmp_path, caplog):
     assert_array_equal(mine["x"], named["y"])
 
 
+@pytest.mark.parametrize("left_out", [(), (5, 6)], ids=["eleven columns", "nine"])
+def test_starfinder_without_dates(tmp_path, caplog, left_out):
+    """The third column is zero in all rows: no date. In some of them it is none of StarFinder's lists."""
+    caplog.set_level("INFO", logger="legdistort")
+    text = _without_names(FLYSTAR, *left_out)
+    bare = read(tmp_path, "A.lis", text.replace("2014.944", "0.000"), error=0.01)
+    dated = read(tmp_path, "B.lis", text, error=0.01)
+    assert set(dated.colnames) - set(bare.colnames) == {"epoch"}
+    assert "t" not in bare.colnames
+    for name in ("x", "y", "x_err", "mag", "flux"):
+        assert_array_equal(bare[name], dated[name])
+    assert caplog.text.count("the dates (t) are zero: when the stars were seen is not known") == 1
+    mixed = read(tmp_path, "C.lis", text.replace("2014.944", "0.000", 1))
+    assert mixed.colnames[0] == "col1"
+    named = read(tmp_path, "D.lis", FLYSTAR.replace("2014.944", "0.000"))
+    assert not {"epoch", "t"} & set(named.colnames)
+
+
 @pytest.mark.parametrize(
     "wrong", [{2: "57000.5"}, {8: "12.0"}, {9: "3.5"}, {3: "abc"}], ids=["MJD", "corr", "frames", "word"]
 )

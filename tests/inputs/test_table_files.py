@@ -474,4 +474,6 @@ def test_the_error_that_is_filled_in_is_told_where_it_is(tmp_path, caplog, missi
         found = read_table(tmp_path / "list.csv", error=0.02)
     assert found["x_err"].value.tolist() == [0.02] * missing + [0.1] * (3 - missing)
     said = [record.getMessage() for record in caplog.records if "without an error" in record.getMessage()]
-    assert said == ([] if words is None else [f"{words} come without an error; it is taken as 0.02 pixels"])
+    assert said == (
+        [] if words is None else [f"where {words} of a list come without an error, it is taken as 0.02 pixels"]
+    )

@@ -108,6 +108,48 @@ def test_stars_kept_out_have_the_law():
     assert solution.diagnostics.validation.ratio == pytest.approx(1, abs=0.1)
 
 
+def law_of(table, poses):
+    """Solution with a law of brightness, and its errors in an exposure, (n,)."""
+    matches = ld.Matches.from_table(table, shape=(SIZE, SIZE), poses=poses)
+    solution = ld.solve(matches, degree=2, clip=None, errors="by-brightness")
+    return solution, solution.residuals["x_err"].value[np.asarray(table["exposure"]) == "e04"]
+
+
+def test_zero_points_of_lists_are_not_their_errors(tmp_path):
+    """One exposure whose fluxes have another unit has the errors that it has without, wherever the law is applied."""
+    table, _, poses = drawn(3, "by-brightness")
+    solution, expected = law_of(table, poses)
+    odd = np.asarray(table["exposure"]) == "e04"
+    table["flux"] = np.where(odd, table["flux"] / 12, table["flux"])
+    shifted, found = law_of(table, poses)
+    assert_allclose(found, expected, rtol=1e-4)
+    levels = shifted.diagnostics.error_law.levels
+    assert levels["e04"] / levels["e03"] == pytest.approx(12, rel=1e-3)
+    assert "; fluxes times 0.813 to 9.76 by exposure, by common stars" in str(shifted.diagnostics.error_law)
+    assert solution.diagnostics.error_law.levels == {}
+    back = ld.Solution.read(shifted.write(tmp_path / "s.asdf"))
+    rows, plain = table[odd][:20], drawn(3, "by-brightness")[0][odd][:20]
+    assert_allclose(back.correct_table(rows)["x_err"].value, solution.correct_table(plain)["x_err"].value, rtol=1e-3)
+    one = back["e04"].correct([[500.0, 600.0]], errors=0.1, flux=100.0).relative
+    assert_allclose(one, solution["e04"].correct([[500.0, 600.0]], errors=0.1, flux=1200.0).relative, rtol=1e-3)
+
+
+def test_counts_of_short_exposures_tell_their_errors():
+    """A tenth of the time: faint stars have larger errors, bright ones have their floor; no factor makes that good."""
+    table, _, poses = drawn(3, "by-brightness")
+    rng, flux = np.random.default_rng(3), np.array(table["flux"])
+    short = np.isin(table["exposure"], [f"e{i:02d}" for i in range(6)])
+    counts = np.where(short, flux / 10, flux)
+    long, true = (np.sqrt((3 / f) ** 2 + 0.2**2 / f + 0.01**2) for f in (flux, counts))
+    for name in "xy":
+        table[name] += rng.normal(0, np.sqrt(true**2 - long**2)) * u.pix
+    table["flux"] = counts
+    solution, found = law_of(table, poses)
+    assert solution.diagnostics.error_law.levels == {}
+    ratio = found / true[np.asarray(table["exposure"]) == "e04"]
+    assert np.ptp(np.log(ratio)) < 0.3
+
+
 # -- by hand
 
 
@@ -218,6 +260,35 @@ def test_positions_without_a_flux_keep_their_errors_with_a_warning(plain):
         solution[name].correct(PIXELS, errors=0.0)  # no measurement
         solution[name].correct(PIXELS)
         plain[name].correct(PIXELS, errors=0.03, flux=np.nan)
+
+
+def test_lists_without_errors_have_those_of_the_law(plain):
+    """Where they have a flux or magnitude; else another error is asked for, and nothing is said of solve."""
+    solution = finding(plain, error_law=ErrorLaw(3.0, 0.2, 0.005, {plain.names[0]: 2.0}, {plain.names[0]: 10.0}))
+    table = QTable({"exposure": [plain.names[0]] * 4, "mag": -2.5 * np.log10([100.0, 1e3, 1e4, 1e5])})
+    table["x"], table["y"] = PIXELS.T * u.pix
+    flux = 10 * np.array([100.0, 1e3, 1e4, 1e5])
+    sigma = 2 * np.sqrt((3.0 / flux) ** 2 + 0.2**2 / flux + 0.005**2)
+    found = solution.correct_table(table)
+    stated = table.copy()
+    stated["x_err"] = stated["y_err"] = sigma * u.pix
+    expected = finding(plain).correct_table(stated)
+    for name in ("x_err", "y_err", "x_err_abs"):
+        assert_allclose(found[name].value, expected[name].value)
+    some = stated.copy()
+    some["x_err"][1] = np.nan * u.pix
+    assert_allclose(solution.correct_table(some)["x_err"].value, expected["x_err"].value)
+    table.remove_column("mag")
+    with pytest.raises(
+        InputError, match=r"lacks the columns x_err, y_err; .*--error PIXELS, or a column flux or mag: "
+    ):
+        solution.correct_table(table)
+    with pytest.raises(InputError, match=r"lacks the columns x_err, y_err; .* or --error PIXELS\)$"):
+        plain.correct_table(table)
+    stated["mag"] = [10.0, 99.0, 99.0, 10.0]
+    stated.remove_columns(["x_err", "y_err"])
+    with pytest.raises(InputError, match="x_err is not a positive finite number in 2 of 4 rows"):
+        solution.correct_table(stated)
 
 
 def test_bad_fluxes_are_named(plain):

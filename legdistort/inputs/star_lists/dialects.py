@@ -138,7 +138,8 @@ def _named(table):
     except InputError:
         return table
     year, corr, frames = found["t"], found["corr"], found["N_frames"]
-    if not (np.all((year > _YEARS[0]) & (year < _YEARS[1])) and np.all((corr >= 0) & (corr <= 1.001))):
+    dated = np.all((year > _YEARS[0]) & (year < _YEARS[1])) or np.all(year == 0)
+    if not (dated and np.all((corr >= 0) & (corr <= 1.001))):
         return table
     if not np.all((frames >= 0) & (frames == np.round(frames))) or np.any(found.get("xe", np.ones(1)) < 0):
         return table
@@ -182,6 +183,7 @@ def understand(table, columns, *, without_errors=False):
     dialect = next((dialect for dialect in DIALECTS if dialect.speaks(table)), None)
     if dialect is None:
         return table, columns, 0
+    table = _without_no_date(table, columns, dialect)
     present, found = set(table.colnames), {}
     for name, choices in dialect.columns.items():
         theirs = next((choice for choice in choices if choice in present), None)
@@ -199,6 +201,16 @@ def understand(table, columns, *, without_errors=False):
         table["flags"] = flags
         table = _without_lost(table, columns | found)
     return table, columns | found, dialect.origin
+
+
+def _without_no_date(table, columns, dialect):
+    """The table without dates that are all zero, as StarFinder writes them where it is not told any; says so."""
+    if dialect.columns.get("epoch") != ("t",) or not {"t"} <= set(table.colnames) - set(columns.values()):
+        return table
+    if not len(table) or np.any(values(table, "t") != 0):
+        return table
+    log.info("the dates (t) are zero: when the stars were seen is not known")
+    return table[[name for name in table.colnames if name != "t"]]
 
 
 def _without_lost(table, columns):

@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import brentq
 
+from ...cameras.star_scales import flux_levels
 from ...geometry import basis
 from ...results.check import FALSE_ALARM, STATES, WRONG
-from ...results.diagnostics import ErrorLaw
+from ...results.diagnostics import ErrorLaw, filled
 from ..terms.turbulence import can_be_found
 from .known_effects import MOTIONS, SHARE, STATICS, effects_in
 from .residual_tests import in_cells
@@ -291,6 +292,11 @@ def _other_errors(solution, residuals, observed):
     known = residuals.used & (flux > 0) & np.isfinite(flux) & (free > 0.1)
     if np.count_nonzero(known) < _FEWEST:
         return
-    law = ErrorLaw.of(flux[known], (squares / np.maximum(free, 0.1) * variance)[known])
-    factor = law.sigma(np.where(flux > 0, flux, flux[known].min())) / np.sqrt(variance)
+    problem = residuals.problem
+    levels = flux_levels(problem.exposure, problem.star, flux, len(problem.names))
+    measured = (squares / np.maximum(free, 0.1) * variance)[known]
+    law, of_exposure, level = ErrorLaw.likelier(flux[known], measured, problem.exposure[known], levels)
+    level = level[problem.exposure]
+    sigma = law.sigma(filled(flux, level) * level) * of_exposure[problem.exposure]
+    factor = sigma / np.sqrt(variance)
     yield "by-brightness", factor * np.sqrt(np.sum(squares / factor**2) / dof) / in_force

@@ -10,14 +10,13 @@ from dataclasses import replace
 import numpy as np
 from astropy import units as u
 
+from ...cameras.star_scales import flux_levels
 from ...exceptions import InputError
-from ...results.diagnostics import ErrorLaw
+from ...results.diagnostics import ErrorLaw, filled
 from .. import clipping, single_fit
 
 #: Fits one after the other: the law of each gives the weights of the next. They settle in two or three.
 ROUNDS = 4
-#: An exposure counts as if so many of its stars scattered as those of the others: its factor is known as well as 10 %.
-COMMON_STARS = 20
 #: Observations that are needed for a law.
 FEWEST = 20
 
@@ -47,19 +46,19 @@ def estimate_by_brightness(matches, options):
         Without fluxes, or with too few observations.
     """
     flux = _fluxes(matches)
-    options = replace(options, errors="stated")
-    fit, law = single_fit.estimate(matches, options), None
+    options, levels = replace(options, errors="stated"), _levels(matches, flux)
+    fit = single_fit.estimate(matches, options)
     for _ in range(ROUNDS):
-        law = _law(fit, law)
-        fit = single_fit.estimate(_with_errors(matches, law.sigma(flux, matches.table["exposure"])), options)
+        law = _law(fit, levels)
+        fit = single_fit.estimate(_with_errors(matches, law, flux), options)
     if fit.dof > 0 and fit.chi2 > 0:
         law = law.scaled(np.sqrt(fit.chi2 / fit.dof))
-        fit = single_fit.estimate(_with_errors(matches, law.sigma(flux, matches.table["exposure"])), options)
+        fit = single_fit.estimate(_with_errors(matches, law, flux), options)
     return fit, law
 
 
 def _fluxes(matches):
-    """Fluxes of all observations; what has none gets that of the faintest."""
+    """Fluxes of all observations, NaN for what has none."""
     table = matches.table
     flux = np.full(len(table), np.nan)
     if "flux" in table.colnames:
@@ -71,28 +70,34 @@ def _fluxes(matches):
             f"positions have a positive flux: give a column flux or mag, by its name in the list if it has another "
             f"(--columns flux=..., --columns mag=...), for at least {FEWEST}"
         )
-    return np.where(known, flux, flux[known].min())
+    return np.where(known, flux, np.nan)
 
 
-def _with_errors(matches, sigma):
-    table = matches.table.copy()
+def _levels(matches, flux):
+    """The `flux_levels` of matches with fluxes (n,), ``{exposure: factor}``."""
+    obs, detector = matches.observations, None
+    if matches.camera.has_focal_plane:
+        detector = np.unique(matches.camera.ids(matches.table), return_inverse=True)[1]
+    levels = flux_levels(obs.exposure, obs.star, flux, len(obs.names), detector)
+    return dict(zip(obs.names, levels.tolist(), strict=True))
+
+
+def _with_errors(matches, law, flux):
+    """The matches with the errors of a law, at fluxes (n,)."""
+    table, names = matches.table.copy(), matches.table["exposure"]
+    level = law.at_level(np.ones(len(table)), names)
     for name in ("x_err", "y_err"):
-        table[name] = sigma * u.pix
+        table[name] = law.sigma(filled(flux, level), names) * u.pix
     return replace(matches, table=table)
 
 
-def _law(fit, before):
-    """The `ErrorLaw` of the residuals of a fit; `before` is that of its weights, if there is one."""
+def _law(fit, levels):
+    """The `ErrorLaw` of the residuals of a fit."""
     problem, obs = fit.problem, fit.matches.observations
-    names = problem.names
     pull = problem.in_table_order(clipping.deviations(problem, fit.result.state, fit.used * fit.result.robust))
     used = problem.in_table_order(fit.used)
     measured = (pull**2 / 2 * obs.covariance[:, :2].mean(axis=1))[used]
-    flux, exposure = _fluxes(fit.matches)[used], obs.exposure[used]
-    factor = np.array([before.factors.get(name, 1.0) if before else 1.0 for name in names])
-    count = np.bincount(exposure, minlength=len(names))
-    for _ in range(2):
-        law = ErrorLaw.of(flux, measured / factor[exposure] ** 2)
-        ratio = np.bincount(exposure, measured / law.sigma(flux) ** 2, len(names))
-        factor = np.sqrt((ratio + COMMON_STARS) / (count + COMMON_STARS))
-    return replace(law, factors=dict(zip(names, factor.tolist(), strict=True)))
+    levels = np.array([levels[name] for name in problem.names])
+    law, *found = ErrorLaw.likelier(_fluxes(fit.matches)[used], measured, obs.exposure[used], levels)
+    factors, by_exposure = (dict(zip(problem.names, each.tolist(), strict=True)) for each in found)
+    return replace(law, factors=factors, levels={} if np.all(found[1] == 1) else by_exposure)
