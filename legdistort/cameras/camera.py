@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import logging
 import re
+from base64 import b64decode, b64encode
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from dataclasses import field as stored
 from functools import cached_property
@@ -590,12 +592,22 @@ class Camera(ShownAsPrinted):
         return plot_camera(self, ax=ax, scale=scale)
 
     def to_meta(self) -> dict[str, Any]:
-        """The camera as plain numbers, lists and strings, for the header of a table file; see `from_meta`."""
-        return codec.to_tree(self, plain=True)
+        """The camera as plain numbers, lists and strings, for the header of a table file; see `from_meta`.
+
+        The `covariance`, which may have 100,000 numbers, is one text: base64 of its rows as little-endian doubles.
+        """
+        tree = codec.to_tree(replace(self, covariance=None), plain=True)
+        if self.covariance is not None:
+            tree["covariance"] = b64encode(self.covariance.astype("<f8").tobytes()).decode()
+        return tree
 
     @classmethod
     def from_meta(cls, meta: Mapping[str, Any]) -> Camera:
         """The camera that `to_meta` wrote."""
+        if isinstance(meta.get("covariance"), str):
+            with suppress(ValueError):  # what is no such text is refused as no matrix
+                values = np.frombuffer(b64decode(meta["covariance"], validate=True), "<f8")
+                meta = {**meta, "covariance": values.reshape(int(np.sqrt(len(values))), -1)}
         return storage.from_tree(meta, cls)
 
     def write(self, path: StrPath, *, overwrite: bool = False) -> Path:

@@ -66,6 +66,22 @@ def squared_pull(solution, sky):
     return chi2, 2 * (np.count_nonzero(well) - 10)
 
 
+def test_the_header_of_a_table_has_the_covariance_as_one_text():
+    """A list of numbers took seconds to write and to read."""
+    sigma = np.where(np.arange(10) < 3, 0.0, 0.1) * np.ones((2, 1))
+    chips = {
+        key: replace(each, static=np.zeros((2, 10)), static_sigma=sigma) for key, each in camera().detectors.items()
+    }
+    known = ld.Camera("FOUR", chips, covariance=np.diag(np.tile(sigma.ravel() ** 2, 4)))
+    assert known.covariance is not None
+    meta = known.to_meta()
+    assert isinstance(meta["covariance"], str)
+    np.testing.assert_array_equal(ld.Camera.from_meta(meta).covariance, known.covariance)
+    for text in ("left", meta["covariance"][:-8]):
+        with pytest.raises(ValueError, match="covariance"):
+            ld.Camera.from_meta({**meta, "covariance": text})
+
+
 def taught(seed, **how):
     """The solution of a night, and that of a brighter one with its camera, and the sky of this."""
     optics = Optics(seed)
