@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from ..cameras.detector import affine_of, moved_by
 from ..cameras.stated_errors import errors_of, resized, with_errors
@@ -504,12 +505,13 @@ def camera_step(fit, sought, departure, stated=False):
     precision, before = sought.stated.astype(float), sought.numbers @ departure[free]
     normal, pull = _told(fit, follow, free)
     pull = root.T @ pull - precision * before
-    inverse, weak = _inverse(root.T @ normal @ root, precision, np.einsum("kr,kl,lr->r", root, follow.alone, root))
+    half, weak = _root_of_inverse(root.T @ normal @ root, precision, np.einsum("kr,kl,lr->r", root, follow.alone, root))
     weak = weak @ root.T
     held = held_changes(weak, change_weights(free, stated), _slides(fit, free, weak))
     change = np.zeros(free.shape)
-    change[free] = held @ root @ (before + inverse @ pull) - departure[free]
-    covariance = held @ root @ inverse @ root.T @ held.T
+    change[free] = held @ root @ (before + half @ (half.T @ pull)) - departure[free]
+    known = held @ root @ half
+    covariance = known @ known.T
     freedom = float(np.sum(covariance * normal))
     return CameraStep(change, covariance, free, follow.stars[:2], follow.coefficients, freedom, weak)
 
@@ -544,8 +546,8 @@ def _told(fit, follow, free):
     return scaled / np.outer(unit, unit), left @ (unit * follow.pull) / unit
 
 
-def _inverse(normal, precision, alone):
-    """Inverse of the sum, on what data or prior determine, and the directions (m, k) that neither does.
+def _root_of_inverse(normal, precision, alone):
+    """R of the inverse R R' of the sum, (k, n), on what data or prior determine; directions (m, k) that neither does.
 
     `alone` (k,) is what the data would determine of each unknown if all others were known.
     """
@@ -553,8 +555,8 @@ def _inverse(normal, precision, alone):
     values, vectors = np.linalg.eigh(normal * np.outer(unit, unit) + np.diag(precision > 0))
     good = values > _WEAK
     known = vectors[:, good] * unit[:, None]
-    inner = np.linalg.inv(known.T @ (normal + np.diag(precision)) @ known)
-    return known @ inner @ known.T, (vectors[:, ~good] * unit[:, None]).T
+    root = np.linalg.cholesky(known.T @ (normal + np.diag(precision)) @ known)
+    return solve_triangular(root, known.T, lower=True).T, (vectors[:, ~good] * unit[:, None]).T
 
 
 def _slides(fit, free, weak):
