@@ -33,11 +33,11 @@ def renewed_footprint(view, hdulist, hdu):
     """A `~astropy.io.fits.Header` with the footprint by the view, where that of the image has one; else it is empty."""
     text = hdu.header.get("S_REGION")
     former = former_wcs(view, hdulist, hdu) if isinstance(text, str) else None
-    region = None if former is None else _renewed(text, former, view)
+    region = None if former is None else renewed_region(text, former, view)
     return fits.Header() if region is None else fits.Header({"S_REGION": region})
 
 
-def _renewed(text, former, view):
+def renewed_region(text, former, view):
     """An ``S_REGION`` whose corners are where the WCS of a view has the pixels at which they were.
 
     Parameters

@@ -1,6 +1,7 @@
 """Another gwcs in an ASDF file of somebody else's, in which every other key, tag and block stays as it is.
 
-The text of the WCS is exchanged within the YAML of the file; what stands before and after it, and the arrays that
+But for the footprint that pipelines keep beside the WCS, ``wcsinfo.s_region``, which is that of the new one. The text of
+the WCS is exchanged within the YAML of the file; what stands before and after it, and the arrays that
 follow, are not read as objects, which would take the packages that wrote them.
 """
 
@@ -16,11 +17,13 @@ from ..exceptions import InputError
 from ..inputs.wcs_files import wcs_in
 from ..runtime.asdf_files import ARCHIVES, read_tree
 from ..runtime.fits_bytes import BLOCK
+from .footprints import renewed_region
 from .refinement import refine
 
 _END = re.compile(rb"\n\.\.\.\r?\n")
 _INDEX = b"#ASDF BLOCK INDEX"
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_FOOTPRINT = "wcsinfo", "s_region"  # beside the WCS
 _HANDLE = "%TAG ! tag:stsci.edu:asdf/"
 #: Names of repeated parts, which asdf counts from one in every file.
 _ANCHOR = re.compile(r"(?<=[\s,\[{])([&*])id(\d+)\b")
@@ -60,7 +63,8 @@ def refined_tree(content, found, view, label):
         If it cannot be refined.
     """
     keys, wcs, _ = found
-    return _exchanged(content, keys, refine(wcs, view).stock(), label)
+    content = _exchanged(content, keys, refine(wcs, view).stock(), label)
+    return _with_text(content, (*keys[:-1], *_FOOTPRINT), lambda text: renewed_region(text, wcs, view))
 
 
 def table_of(header, content):
@@ -98,11 +102,31 @@ def _exchanged(content, keys, wcs, label):
     return out + _moved(rest, len(out) - len(content) + len(rest))
 
 
-def _span(text, keys):
-    """Where the value of nested keys begins and ends in a YAML text."""
+def _with_text(content, keys, renewed):
+    """The bytes of an ASDF file in which the text at nested keys, if there is one, is another; None leaves it."""
+    end = _END.search(content)
+    text, rest = content[: end.end()].decode("utf-8"), content[end.end() :]
+    node = _node(text, keys)
+    new = renewed(node.value) if isinstance(node, yaml.ScalarNode) else None
+    if new is None:
+        return content
+    first, last = _span(text, keys)
+    out = f"{text[:first]}{new}{text[last:]}".encode()
+    return out + _moved(rest, len(out) - end.end())
+
+
+def _node(text, keys):
+    """The value of nested keys in a YAML text, None where they lead to none."""
     node = yaml.compose(text, Loader=_LOADER)
     for key in keys:
-        node = next(value for name, value in node.value if name.value == key)
+        inside = node.value if isinstance(node, yaml.MappingNode) else ()
+        node = next((value for name, value in inside if name.value == key), None)
+    return node
+
+
+def _span(text, keys):
+    """Where the value of nested keys begins and ends in a YAML text."""
+    node = _node(text, keys)
     starts = np.cumsum([0, *map(len, text.splitlines(keepends=True))])
     return tuple(int(starts[mark.line]) + mark.column for mark in (node.start_mark, node.end_mark))
 

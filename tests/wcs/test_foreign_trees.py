@@ -59,6 +59,30 @@ def yaml_of(content):
 
 
 @pytest.mark.slow
+def test_the_footprint_beside_the_wcs_is_renewed(night, tmp_path):
+    """Pipelines keep the corners on the sky as text: of the former WCS, if nobody writes it anew."""
+    paths, solution = night
+    path, name = tmp_path / paths[0].name, solution.names[0]
+    tree = model_of(paths[0])
+    ny, nx = tree["data"].shape
+    corners = np.array([[-0.5, -0.5], [nx - 0.5, -0.5], [nx - 0.5, ny - 0.5], [-0.5, ny - 0.5]])
+    sky = np.stack(tree["meta"]["wcs"](*corners.T, with_bounding_box=False), axis=1)
+    region = "POLYGON ICRS  " + " ".join(f"{each:.9f}" for each in sky.ravel()) + " "
+    others = {"s_region": region, "vparity": -1, "text": "s_region: POLYGON ICRS 1 2"}
+    asdf.AsdfFile({"roman": tree | {"meta": {"wcsinfo": others} | tree["meta"]}}).write_to(path)
+    (done,) = attach(solution, path, out=tmp_path / "out", kind="sip")
+    with asdf.open(done.path) as new:
+        meta = new["roman"]["meta"]
+        assert meta["wcsinfo"]["text"] == others["text"] and meta["wcsinfo"]["vparity"] == -1
+        found = np.array(meta["wcsinfo"]["s_region"].split()[2:], dtype=float).reshape(-1, 2)
+        by_wcs = np.stack(meta["wcs"](*corners.T, with_bounding_box=False), axis=1)
+        assert_array_equal(new["roman"]["data"], tree["data"])
+        assert_allclose(meta["zlast"], np.arange(40.0))
+    assert_allclose(found, by_wcs, rtol=0, atol=1e-9)
+    assert np.abs(found - sky).max() > 1e-8
+
+
+@pytest.mark.slow
 def test_asdf_files_of_roman(night, tmp_path):
     paths, solution = night
     path, name = tmp_path / paths[0].name, solution.names[0]
