@@ -1,8 +1,8 @@
 """Another gwcs in an ASDF file of somebody else's, in which every other key, tag and block stays as it is.
 
-But for the footprint that pipelines keep beside the WCS, ``wcsinfo.s_region``, which is that of the new one. The text of
-the WCS is exchanged within the YAML of the file; what stands before and after it, and the arrays that
-follow, are not read as objects, which would take the packages that wrote them.
+But for the footprint that pipelines keep beside the WCS, ``wcsinfo.s_region``, which becomes that of the new one. The
+texts are exchanged within the YAML of the file; what stands before and after them, and the arrays that follow, are not
+read as objects, which would take the packages that wrote them.
 """
 
 import io

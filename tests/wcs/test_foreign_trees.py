@@ -62,8 +62,7 @@ def yaml_of(content):
 def test_the_footprint_beside_the_wcs_is_renewed(night, tmp_path):
     """Pipelines keep the corners on the sky as text: of the former WCS, if nobody writes it anew."""
     paths, solution = night
-    path, name = tmp_path / paths[0].name, solution.names[0]
-    tree = model_of(paths[0])
+    path, tree = tmp_path / paths[0].name, model_of(paths[0])
     ny, nx = tree["data"].shape
     corners = np.array([[-0.5, -0.5], [nx - 0.5, -0.5], [nx - 0.5, ny - 0.5], [-0.5, ny - 0.5]])
     sky = np.stack(tree["meta"]["wcs"](*corners.T, with_bounding_box=False), axis=1)
@@ -73,7 +72,7 @@ def test_the_footprint_beside_the_wcs_is_renewed(night, tmp_path):
     (done,) = attach(solution, path, out=tmp_path / "out", kind="sip")
     with asdf.open(done.path) as new:
         meta = new["roman"]["meta"]
-        assert meta["wcsinfo"]["text"] == others["text"] and meta["wcsinfo"]["vparity"] == -1
+        assert meta["wcsinfo"] | {"s_region": region} == others
         found = np.array(meta["wcsinfo"]["s_region"].split()[2:], dtype=float).reshape(-1, 2)
         by_wcs = np.stack(meta["wcs"](*corners.T, with_bounding_box=False), axis=1)
         assert_array_equal(new["roman"]["data"], tree["data"])
