@@ -220,8 +220,7 @@ def test_every_minimum_can_be_pinned():
 def test_versions_agree():
     version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     newest = re.search(r"^## (\S+)", (ROOT / "CHANGES.md").read_text(encoding="utf-8"), re.MULTILINE).group(1)
-    cited = re.search(r"^version: (\S+)", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE).group(1)
-    assert newest == cited == version == legdistort.__version__
+    assert newest == version == legdistort.__version__
 
 
 def test_every_public_name_is_in_the_reference():
