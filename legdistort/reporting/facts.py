@@ -1,11 +1,13 @@
 """The sentences of a report: what was observed, the figures of the solution, and a paragraph for a paper."""
 
 import numpy as np
+from astropy.time import Time
 from markupsafe import Markup, escape
 
 from ..exceptions import reasons_of
 from ..results import in_tables
 from ..results.check import WRONG
+from ..results.nights import blocks
 from ..runtime.trees.codec import to_tree
 from .tables import count
 
@@ -38,6 +40,22 @@ def facts_of(solution, summary):
     if "max_inverse_error_px" not in facts:
         facts["max_inverse_error_px"] = in_tables.largest_inverse_error(solution)
     return facts
+
+
+def title(facts):
+    """What was observed, and with what, as far as it is known."""
+    seen = facts["observed"]
+    what = ", ".join(seen[key] for key in ("target", "instrument", "filter") if seen.get(key))
+    return what or f"Distortion of {count(facts['n_exposures'], 'exposure')}"
+
+
+def dated_names(solution):
+    """Names of the exposures, with their dates where these are known."""
+    years = blocks(solution)[2]
+    dates = [
+        f", {Time(year, format='jyear').isot[:16].replace('T', ' ')}" if np.isfinite(year) else "" for year in years
+    ]
+    return [f"{name}{date}" for name, date in zip(solution.names, dates, strict=True)]
 
 
 def observed_rows(solution, facts):

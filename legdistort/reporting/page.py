@@ -13,7 +13,7 @@ from ..runtime.outputs import replacing
 from .checks_table import verdict
 from .comparison import compared_corrections, compared_stacks
 from .cutouts import cut_out
-from .facts import BIBTEX, facts_of, methods, observed_rows, solution_rows, truth_rows
+from .facts import BIBTEX, dated_names, facts_of, methods, observed_rows, solution_rows, title, truth_rows
 from .pictures import Gallery
 from .svg import STYLE
 from .tables import count, detectors_table, exposures_table, nights_table, stars_table, stated_table
@@ -106,9 +106,9 @@ def render(
     with style.context(["default", STYLE]), warnings.catch_warnings():  # not the user's style
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # a name in a script that the font lacks
         shown = {
-            "title": f"Distortion of {count(facts['n_exposures'], 'exposure')}",
-            "lead": f"{count(facts['n_stars'], 'star')}, {count(facts['n_observations'], 'position')}, "
-            f"Legendre polynomials of degree {solution.degree}",
+            "title": title(facts),
+            "lead": f"Distortion of {count(facts['n_exposures'], 'exposure')}: {count(facts['n_stars'], 'star')}, "
+            f"{count(facts['n_observations'], 'position')}, Legendre polynomials of degree {solution.degree}",
             "verdict": verdict(facts["checks"]),
             "observed": observed_rows(solution, facts),
             "facts": solution_rows(solution, facts),
@@ -117,7 +117,7 @@ def render(
             "bibtex": BIBTEX,
             "files": list(map(str, files)),
             "version": version("legdistort"),
-            "names": {"s": [str(n) for n in solution.estimate.star_names], "e": list(solution.names)},
+            "names": {"s": [str(n) for n in solution.estimate.star_names], "e": dated_names(solution)},
             "cutouts": cut_out(solution, mosaic, exposures, fwhm=_fwhm(facts)),
             **_pictures(gallery, solution, pulls, mosaic, joint and joint.completeness),
             **_details(gallery, solution, pulls, psfs, facts, comparison, stacks),

@@ -24,13 +24,16 @@ from legdistort.cameras.detector import Place
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis
 from legdistort.inputs.exposures import Exposure, observed
+from legdistort.matching.matches import Matches
 from legdistort.plots import elements
+from legdistort.reporting import facts
 from legdistort.reporting import page as report
 from legdistort.reporting.pictures import Picture
 from legdistort.reporting.svg import STYLE, detached_figure, svg_of
 from legdistort.reporting.tables import detectors_table
 from legdistort.results import in_tables
 from legdistort.simulation import observations
+from legdistort.simulation.observations import simulate_matches
 from legdistort.solving.estimation import solve
 
 ODD = ["a<b>&\"c'", "$x$_\\frac{", "<script>alert(1)</script>", "星 plain"]
@@ -93,7 +96,7 @@ def tables_only(monkeypatch):
 
 
 def test_page_is_well_formed_and_needs_nothing_else(page, text):
-    assert page.references == []  # no files were named
+    assert all(each.startswith("#part-") for each in page.references)  # no files were named
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)
     assert {"link", "iframe", "object"}.isdisjoint(page.tags)
     assert re.findall(r"<script[^>]*>", text) == ['<script type="application/json" id="names">', "<script>"]
@@ -110,7 +113,34 @@ def test_script_is_short():
 
 
 def test_files_beside_it_are_linked(solution, tables_only):
-    assert Page(report.render(solution, files=["a b.fits", "wcs/"])).references == ["a%20b.fits", "wcs/"]
+    references = Page(report.render(solution, files=["a b.fits", "wcs/"])).references
+    assert [each for each in references if each[0] != "#"] == ["a%20b.fits", "wcs/"]
+
+
+def test_the_contents_lead_to_every_part(text):
+    listed = re.findall(r'<li><a href="#(part-\d+)">([^<]*)</a></li>', text)
+    assert listed == re.findall(r'<h2 id="(part-\d+)">([^<]*)</h2>', text)
+    assert {"Solution", "Residuals", "Exposures", "Stars"} <= {words for _, words in listed}
+
+
+def test_the_title_says_what_was_observed(solution, tables_only):
+    seen = {"target": "NGC <1>", "instrument": "GSAOI", "dates": "2014-05-12"}
+    page = report.render(solution, summary={"observed": seen})
+    assert "<title>NGC &lt;1&gt;, GSAOI</title>" in page
+    assert "<h1>NGC &lt;1&gt;, GSAOI</h1>" in page
+    assert "<h1>Distortion of 4 exposures</h1>" in report.render(solution)
+
+
+def test_points_tell_when_their_exposure_was_taken():
+    table = simulate_matches(n_exposures=3, n_stars=30, seed=2).matches.table.copy()
+    years = {"exp00": 2014.5, "exp01": np.nan, "exp02": 2016.0}
+    table["epoch"] = [years[name] for name in table["exposure"]] * u.yr
+    solution = solve(Matches.from_table(table, shape=(2048, 2048)), degree=1)
+    assert facts.dated_names(solution) == ["exp00, 2014-07-02 15:00", "exp01", "exp02, 2016-01-01 12:00"]
+
+
+def test_all_checks_have_a_row(page, solution):
+    assert {check.name for check in solution.checks} <= set(page.cells)
 
 
 def test_every_name_is_there_literally(page):

@@ -54,7 +54,7 @@ def show(browser):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1200, 700])
+@pytest.mark.parametrize("width", [1200, 700, 400])
 def test_it_fits_and_its_text_can_be_read(show, path, width, scheme):
     tab = show(path, width, scheme)
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
@@ -66,6 +66,22 @@ def test_it_fits_and_its_text_can_be_read(show, path, width, scheme):
     assert (paper > 0.9) if scheme == "light" else (paper < 0.2)
     assert abs(ink - paper) > 0.6
     assert text == ink
+
+
+def test_the_contents_unfold_what_they_lead_to(show, path):
+    tab = show(path)
+    assert not tab.locator("details.more").evaluate("each => each.open")
+    tab.get_by_role("link", name="Stars", exact=True).click()
+    assert tab.locator("details.more").evaluate("each => each.open")
+    tab.wait_for_function("Math.abs([...document.querySelectorAll('h2')].at(-1).getBoundingClientRect().top) < 900")
+
+
+def test_labels_of_pictures_are_large_enough_on_a_narrow_screen(show, path):
+    tab = show(path, 400)
+    sizes = tab.evaluate(
+        "[...document.querySelectorAll('figure svg text')].map(e => e.getBoundingClientRect().height).filter(h => h)"
+    )
+    assert min(sizes) > 8
 
 
 def test_pointing_at_a_star_marks_it_everywhere(show, path):

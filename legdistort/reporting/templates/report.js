@@ -119,6 +119,16 @@
     }
   }
 
+  // What the list of contents leads to is unfolded
+
+  function unfold() {
+    const target = document.getElementById(location.hash.slice(1));
+    const details = target && target.closest("details");
+    if (details && !details.open) { details.open = true; target.scrollIntoView(); }
+  }
+  window.addEventListener("hashchange", unfold);
+  unfold();
+
   // On paper everything is shown
 
   const folded = () => [...document.querySelectorAll("details:not([open])")];
