@@ -27,6 +27,7 @@ from ..results.settings import Settings
 from ..runtime.guards.units import plain_numbers
 from ..runtime.words import UNSTATED
 from . import minimisers, model_forms, reference_tie, single_fit, star_motions
+from .agreement import undetermined_left_out
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought, common_widths, held, with_declared_size
 from .checks.limits import ALIKE, MOST_NAMED
@@ -230,8 +231,8 @@ def solve(
     InputError
         For bad options.
     SolveError
-        If an exposure has fewer stars than modes, the unknowns are not determined, or exposures contradict one another
-        and no majority shows which are right.
+        If half of the exposures or more have fewer stars than modes, the unknowns are not determined, or exposures
+        contradict one another and no majority shows which are right.
     MatchError
         For one exposure without a reference.
 
@@ -438,6 +439,7 @@ def _fitted(matches, options, sought, join):
     return _in_camera(replace(matches, table=matches.table[~thin]), options, sought, join)
 
 
+@undetermined_left_out
 def _in_camera(matches, options, sought, join):
     """What `_fitted` gives, all ties of detectors believed."""
     camera, selection = None if sought is None else CameraFit(sought, join), None
