@@ -106,18 +106,18 @@ def starved(problem, used):
 
 
 def undetermined_left_out(estimate):
-    """A function like `estimate`, ``estimate(matches, *how)``, that does without what has no answer.
+    """A function like `estimate`, ``estimate(matches, ...)``, that does without what has no answer.
 
     Exposures whose stars do not determine their own distortion, as one that overlaps the others in a strip, are left
     out where they are fewer than the others: one frame does not cost the results of a night.
     """
 
     @functools.wraps(estimate)
-    def determined(matches, *how):
+    def determined(matches, *how, **options):
         left, lost, first = matches, {}, None
         while True:
             try:
-                return estimate(left, *how)
+                return estimate(left, *how, **options)
             except SolveError as error:
                 if not error.exposures:
                     raise

@@ -40,9 +40,9 @@ _ROUNDING = 1e-12  # of a variance, what is left where the constraints hold all 
 _SHOWN = 9.0  # squares that a common distortion which is held costs, in errors, from which the residuals show it
 _WEAK, _SURE = 0.3, 0.3  # eigenvalues below which directions are learnt, where they lack no more than this part of it
 _REMEMBERED = 100  # iterations, and directions
-#: Part of a direction that nothing determines from which it is one of the exposures named alone; and least eigenvalue
-#: of an exposure with its stars known, beside that of the others, below which it is its own.
-_THEIRS, _MUCH_LESS = 0.9, 1e-3
+#: Part of a direction that nothing determines from which it is of the exposures that are named; and least eigenvalue of
+#: an exposure with its stars known, beside that of the others, below which it is its own.
+_THEIRS, _MUCH_LESS = 0.6, 1e-3
 _NOTHING = 1e-9  # eigenvalue of the normalised equations that is rounding
 
 
@@ -296,7 +296,7 @@ def _not_determined(problem, s, blocks):
     """The `SolveError` of a singular system, which names the exposures to blame, the worst first.
 
     As `exposures` it has those whose own stars, even if these were known, determine far less than those of the others,
-    or those that have all of what is not determined.
+    or those that have most of what is not determined.
     """
     values, vectors = np.linalg.eigh(np.nan_to_num(s))
     own = np.linalg.eigvalsh(np.nan_to_num(_normalised(blocks)))[:, 0]
