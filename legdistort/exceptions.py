@@ -55,7 +55,17 @@ class MatchError(LegdistortError, ValueError):
 
 
 class SolveError(LegdistortError, ValueError):
-    """The least-squares problem has no usable answer; lower the degree, add stars or a prior."""
+    """The least-squares problem has no usable answer; lower the degree, add stars or a prior.
+
+    Attributes
+    ----------
+    exposures : tuple of str
+        Exposures whose own unknowns are not determined, where it is these alone.
+    """
+
+    def __init__(self, *args: object, exposures: tuple[str, ...] = ()) -> None:
+        super().__init__(*args)
+        self.exposures = tuple(exposures)
 
 
 class FoldError(LegdistortError, ValueError):

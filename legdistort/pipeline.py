@@ -153,7 +153,8 @@ def run(
     earlier : str or path, optional
         Folder of an earlier run, whose measured positions are taken instead of measuring anew. All options but those of
         reading and measuring may differ, and are those of this call (the command ``run --from`` repeats those of the
-        earlier one). Its frames, or those of them that are given, must be unchanged.
+        earlier one); of cameras that of the earlier run holds unless one with the same detectors is given. Its frames,
+        or those of them that are given, must be unchanged.
     ext : int, str or (str, int), optional
         Extension to read from every file.
     dq_good : int, str or sequence of int, optional
@@ -383,14 +384,12 @@ def _where_to_begin(paths, earlier, measuring, **reading):
         return paths, reading, None
     usual = dict.fromkeys(reading) | vars(MeasureOptions())
     for name, value in (reading | vars(measuring)).items():
-        if value is not usual[name] and value != usual[name]:
-            way = f"; or match {earlier}/detections.ecsv with it (legdistort match --camera) and solve these matches"
+        if name != "camera" and value is not usual[name] and value != usual[name]:
             raise InputError(
                 f"{name} is not to be given with an earlier run: that of {earlier} holds, or measure the frames again"
-                f"{way * (name == 'camera')}"
             )
     before = EarlierRun.read(earlier)
-    return before.frames if paths is None else paths, before.reading | {"camera": before.camera}, before
+    return before.frames if paths is None else paths, before.reading | {"camera": camera or before.camera}, before
 
 
 def _tying(reference, error, degree, epoch):

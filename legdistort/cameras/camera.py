@@ -479,7 +479,8 @@ class Camera(ShownAsPrinted):
         if key not in self.detectors:
             raise InputError(
                 f"{exposure.name} is of detector {key}, and camera {self.name} has {', '.join(self.detectors)}: is it "
-                "a camera of another instrument? Else leave these extensions out, or add the detector to the camera"
+                "a camera of another instrument? Else leave these extensions out, or give a camera whose ids are those "
+                "of the frames (Camera(name, {id: detector}))"
             )
         if exposure.shape != self[key].shape:
             (ny, nx), binned = exposure.shape, ""

@@ -22,6 +22,8 @@ _OF_FILES = ("CCDCHIP", "DETECTOR", "CHIP", "CCDNUM", "DET-ID")
 _IN_NAME = re.compile(
     r"(?<![A-Za-z0-9])(nrc[ab](?:[1-4]|long)|nrs[12]|wfi\d\d|(?:chip|ccd|det|sca)\d{1,3})(?![A-Za-z0-9])", re.IGNORECASE
 )
+#: The number of a detector.
+_NUMBER = re.compile(r"\D*?0*(\d+)")
 #: Years between the beginnings of what counts as one exposure: 2 s by name, a minute by the time alone.
 _APART, _SAME_TIME = 60 / 3.156e7, 2 / 3.156e7
 
@@ -166,7 +168,8 @@ def of_files(exposures, ids):
     """Exposures with `exposure` and `detector`, also those whose detectors are in files of their own.
 
     The detector is that of `ids` which the header names, the exposure is the name of the file without it. Those that
-    have a detector keep it, unless that is none of `ids` and another keyword names one.
+    have a detector keep it, unless that is none of `ids` and another keyword names one, or the detectors of all have
+    the numbers of `ids`, each once (``IM1`` to ``IM4`` for 1 to 4), which is logged.
 
     Parameters
     ----------
@@ -179,11 +182,12 @@ def of_files(exposures, ids):
         For a header that names none of the detectors, or a file name that does not have it.
     """
     known, out = {key.lower(): key for key in ids}, []
+    numbered = _by_number(exposures, known)
     for exposure in exposures:
         if exposure.detector in known.values():
             out.append(exposure)
             continue
-        key = next((known[value.lower()] for value in _named_in(exposure.header) if value.lower() in known), None)
+        key = numbered.get(exposure.detector, _key_of(exposure.header, known))
         if exposure.detector is not None:
             parted = exposure.name == detector_name(exposure.exposure, exposure.detector)
             known_as = {} if key is None else {"detector": key}
@@ -204,6 +208,35 @@ def of_files(exposures, ids):
             )
         out.append(replace(exposure, exposure=whole, detector=key))
     return out
+
+
+def _key_of(header, known):
+    """The detector of ``{lower case: id}`` that a header names; None for none."""
+    return next((known[value.lower()] for value in _named_in(header) if value.lower() in known), None)
+
+
+def _by_number(exposures, known):
+    """``{detector of exposures: id}`` of those that have other names and the same numbers, all of them; else empty.
+
+    Headers that name the detectors, each another one, go before.
+    """
+    called = {}
+    for exposure in exposures:
+        if exposure.detector is not None:
+            called.setdefault(exposure.detector, set()).add(_key_of(exposure.header, known))
+    named = {key for keys in called.values() for key in keys} - {None}
+    if set(called) & set(known.values()) or len(named) == len(called):
+        return {}
+    theirs, ours = (
+        {match[1]: key for key in keys if (match := _NUMBER.fullmatch(key))} for keys in (called, known.values())
+    )
+    if not called or theirs.keys() != ours.keys() or not len(called) == len(theirs) == len(known):
+        return {}
+    pairs = {theirs[number]: ours[number] for number in sorted(theirs, key=int)}
+    log.info(
+        "detectors %s are taken for %s of the camera, by their numbers", ", ".join(pairs), ", ".join(pairs.values())
+    )
+    return pairs
 
 
 def stated_detector(header):

@@ -21,6 +21,8 @@ TOLERANCE = 0.1
 #: The dithers by headers and by stars are compared in so many exposures or more; they contradict each other if a turn
 #: and a scale explain what they differ by, by no more than this chance, and that is more than this part of the dithers.
 _FEWEST, _BY_CHANCE, _DEPARTURE = 4, 1e-4, 0.05
+#: Variance [pix^2] below which a pose counts as exact.
+_EXACT = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,8 +245,11 @@ def sky_by_layout(matches, found, poses):
     return replace(matches.sky, matrix=similarity.compose(matches.sky.matrix, np.mean(moves, axis=0)))
 
 
-def header_map_by(matches, poses, sky):
+def header_map_by(matches, poses, sky, variances):
     """The `Camera.header_map` with the focal plane where a solution has it on the sky; None without the headers'.
+
+    The mean of the exposures by their errors: one whose pose is known badly, as it overlaps the others in a strip,
+    counts by as much.
 
     Parameters
     ----------
@@ -254,6 +259,8 @@ def header_map_by(matches, poses, sky):
         ``{exposure: (2, 3)}``, from the reference plane of the solution to its focal plane.
     sky : `~legdistort.geometry.tangent_plane.TangentPlane` or None
         Where that reference plane lies.
+    variances : sequence of float
+        Of these poses, of rotation and scale [pix^2, per axis at the corners of the focal plane].
     """
     camera = matches.camera
     if camera.header_map is None or matches.sky is None or sky is None:
@@ -263,7 +270,23 @@ def header_map_by(matches, poses, sky):
         places = sky.to_sky(similarity.apply(similarity.invert(pose), corners))
         there = similarity.apply(matches.poses[name], matches.sky.from_sky(places))
         by_header.append(similarity.apply(back, there))
-    return similarity.fit_similarity(np.concatenate(by_header), np.tile(corners, (len(poses), 1)))
+    turned = np.array(by_header) - np.mean(by_header, axis=1, keepdims=True)
+    weights = _weights(turned.reshape(len(poses), -1), np.asarray(variances))
+    return similarity.fit_similarity(np.average(by_header, axis=0, weights=weights), corners)
+
+
+def _weights(values, variances):
+    """Weights (n,) of values (n, k) with variances (n,), each, and a scatter beyond these that all have in common.
+
+    The scatter is found by the method of moments (DerSimonian & Laird 1986).
+    """
+    variances = np.maximum(variances, _EXACT)
+    weights = 1 / variances / np.sum(1 / variances)
+    share = 1 - np.sum(weights**2)
+    if not share > 0:
+        return weights
+    seen = np.mean(weights @ (values - weights @ values) ** 2)
+    return 1 / (variances + max(seen - np.sum(weights * (1 - weights) * variances), 0.0) / share)
 
 
 def _grid(shape, n):

@@ -117,7 +117,8 @@ class EarlierRun:
         Raises
         ------
         InputError
-            Naming a frame that was not measured, that has changed, or that is in no file.
+            Naming a frame that was not measured, that has changed, or that is in no file; or the detectors are called
+            otherwise.
         """
         without = [exposure.name for exposure in exposures if not isinstance(exposure, ExposureFile)]
         if without:
@@ -132,6 +133,12 @@ class EarlierRun:
                 )
             if measured[file] != checksum:
                 raise InputError(f"{file} is not as it was measured in {self.folder}: measure the frames again")
+        known = self.table.meta.get("shapes") or {}
+        if strange := [each.name for each in exposures if known and each.name not in known]:
+            raise InputError(
+                f"{self.folder} has no positions of {strange[0]}: the camera does not name the detectors as they were "
+                "measured; leave it out, or measure the frames again with it"
+            )
         names = [whole_name(exposure) for exposure in exposures]
         table = self.table[np.isin(self.table["exposure"], names)]
         table.meta = {}

@@ -4,12 +4,16 @@ One is left out if three others or more agree, and are more than those that cont
 Otherwise the data do not determine which side is right, and the error names both.
 """
 
-import numpy as np
+import functools
 
-from ..exceptions import SolveError, some_of
+import numpy as np
+from astropy import units as u
+
+from ..exceptions import MatchError, SolveError, some_of
 from ..geometry import pair_agreement
+from ..geometry.star_hull import enclosed_area
 from . import start_values
-from .checks.limits import ALIKE
+from .checks.limits import ALIKE, UNDETERMINED
 
 #: Exposures that must agree before others are left out for their sake.
 FEWEST = 3
@@ -99,6 +103,42 @@ def starved(problem, used):
                 f"{problem.n_free(i)} modes; lower the degree, or give a prior with sigma"
             )
     return out
+
+
+def undetermined_left_out(estimate):
+    """A function like `estimate`, ``estimate(matches, ...)``, that does without what has no answer.
+
+    Exposures whose stars do not determine their own distortion, as one that overlaps the others in a strip, are left
+    out where they are fewer than the others: one frame does not cost the results of a night.
+    """
+
+    @functools.wraps(estimate)
+    def determined(matches, *how, **options):
+        left, lost, first = matches, {}, None
+        while True:
+            try:
+                return estimate(left, *how, **options)
+            except SolveError as error:
+                if not error.exposures:
+                    raise
+                first, blamed = first or error, error.exposures
+            lost |= {name: _undetermined(matches, name) for name in blamed}
+            if 2 * len(lost) >= len(matches.names):
+                raise first
+            try:
+                left = matches.without(lost)
+            except MatchError:  # the others are tied to one another by them alone
+                raise first from None
+
+    return determined
+
+
+def _undetermined(matches, name):
+    """Why an exposure is left out whose stars are too few, or lie too near to one another."""
+    rows, (ny, nx) = matches.table[matches.table["exposure"] == name], matches.shapes[name]
+    xy = np.column_stack([rows["x"].to_value(u.pix), rows["y"].to_value(u.pix)])
+    seen = f"its {len(rows)} stars in common with others, on {enclosed_area(xy) / (nx * ny):.0%} of its frame"
+    return f"{seen}, {UNDETERMINED}"
 
 
 def without_contradictions(problem, good):

@@ -21,15 +21,16 @@ from ..matching.matches import Matches
 from ..priors.prior import Prior, has_distortion
 from ..results.diagnostics import Diagnostics
 from ..results.errors.common_distortion import with_common_map
+from ..results.errors.pose_errors import pose_variances
 from ..results.gauge import warning_of
 from ..results.in_tables import goodness
 from ..results.settings import Settings
 from ..runtime.guards.units import plain_numbers
 from ..runtime.words import UNSTATED
-from . import minimisers, model_forms, reference_tie, single_fit, star_motions
+from . import agreement, minimisers, model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought, common_widths, held, with_declared_size
-from .checks.limits import ALIKE, MOST_NAMED
+from .checks.limits import ALIKE, MOST_NAMED, UNDETERMINED
 from .choices import prior_widths
 from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, validation
@@ -61,6 +62,7 @@ log = logging.getLogger(__name__)
 
 @plain_numbers
 @with_base
+@agreement.undetermined_left_out  # by a reference too
 def solve(
     matches: Matches,
     *,
@@ -230,8 +232,8 @@ def solve(
     InputError
         For bad options.
     SolveError
-        If an exposure has fewer stars than modes, the unknowns are not determined, or exposures contradict one another
-        and no majority shows which are right.
+        If half of the exposures or more have fewer stars than modes, the unknowns are not determined, or exposures
+        contradict one another and no majority shows which are right.
     MatchError
         For one exposure without a reference.
 
@@ -297,7 +299,7 @@ def _with_camera(solution, given):
     """The solution whose camera has what a reference told of its focal plane, for exposures of another field."""
     camera = with_common_map(solution.camera, solution)
     if camera.has_focal_plane and solution.gauge.n_fields == 1:
-        found = header_map_by(given, solution.poses, solution.sky)
+        found = header_map_by(given, solution.poses, solution.sky, pose_variances(solution))
         camera = camera if found is None else camera.with_header_map(found)
     return replace(solution, camera=camera)
 
@@ -438,6 +440,7 @@ def _fitted(matches, options, sought, join):
     return _in_camera(replace(matches, table=matches.table[~thin]), options, sought, join)
 
 
+@agreement.undetermined_left_out
 def _in_camera(matches, options, sought, join):
     """What `_fitted` gives, all ties of detectors believed."""
     camera, selection = None if sought is None else CameraFit(sought, join), None
@@ -560,7 +563,7 @@ def _tell(fit, matches, *, tied):
 
 def _tell_lost_exposures(fit, matches):
     """Warn of exposures left out: of each, but of those of a night that has another distortion together."""
-    new = {name: reason for name, reason in fit.matches.left_out.items() if name not in matches.left_out}
+    new = {n: why for n, why in fit.matches.left_out.items() if n not in matches.left_out or UNDETERMINED in why}
     for reason, names in by_reason(new).items():
         if ALIKE in reason and len(names) > 1:
             warn(f"{len(names)} exposures are left out ({some_of(names, MOST_NAMED)}): {reason}", AssumptionWarning)

@@ -15,8 +15,8 @@ from astropy.wcs import WCS
 
 import legdistort as ld
 from legdistort.cli import main
-from legdistort.exceptions import InputError
-from legdistort.geometry import basis, detector_modes
+from legdistort.exceptions import AssumptionWarning, InputError
+from legdistort.geometry import basis, detector_modes, similarity
 
 #: What headers have wrong: relative scale, rotation [deg]; roll [deg] and pointing [px] of two visits beside that.
 SCALE, TURN, ROLLS, POINTINGS = 3e-4, 0.02, (0.002, -0.003), (2.0, -3.0)
@@ -135,6 +135,30 @@ def test_the_next_visit_has_the_scale_and_the_rotation_of_the_first(night, first
     assert absolute.state == "unknown"
     assert "(match --camera RESULTS)" in absolute.cure
     assert "--prior" not in absolute.cure
+
+
+def in_a_corner(night, share):
+    """The first visit with the stars of one exposure that lie in a corner alone."""
+    matches = matched(night, 0)
+    (ny, nx), table = matches.shapes["e3"], matches.table
+    far = (table["x"].value > share * nx) | (table["y"].value > share * ny)
+    return matches.keep(~(far & (table["exposure"] == "e3")))
+
+
+def test_an_exposure_that_is_known_badly_does_not_spoil_the_scale_of_the_camera(night, catalogue):
+    matches = in_a_corner(night, 0.3)
+    assert np.count_nonzero(matches.table["exposure"] == "e3") == 10
+    camera = ld.solve(matches, static="fit", reference=catalogue).camera
+    assert similarity.describe(camera.header_map)["scale"] == pytest.approx(1 + SCALE, abs=3e-5)  # of 7e-3 by all alike
+
+
+@pytest.mark.slow
+def test_an_exposure_that_a_reference_does_not_determine_is_left_out(night, catalogue):
+    """The fit without the reference has an answer; that with it has none."""
+    with pytest.warns(AssumptionWarning, match="exposure e3 is left out: its 4 stars .* do not determine"):
+        solution = ld.solve(in_a_corner(night, 0.2), static="fit", prior=EVIDENCE, reference=catalogue)
+    assert list(solution.left_out) == ["e3"]
+    assert off_sky(night, solution)[0] == pytest.approx(0, abs=1e-5)
 
 
 @pytest.mark.slow

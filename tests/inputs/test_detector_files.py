@@ -20,7 +20,7 @@ import legdistort
 from legdistort import Exposure, Solution
 from legdistort.cli.parser import main
 from legdistort.exceptions import InputError
-from legdistort.inputs.detector_files import label_of, with_detectors
+from legdistort.inputs.detector_files import label_of, of_files, with_detectors
 from legdistort.inputs.wcs_files import open_wcs
 
 pytestmark = [pytest.mark.filterwarnings("ignore::legdistort.LegdistortWarning"), pytest.mark.usefixtures("undrawn")]
@@ -56,6 +56,56 @@ def test_files_that_were_begun_together():
         for key in (0, 9)
     ]
     assert parts(*night) == [(f"SUPA0012{i}", str(key)) for i in (345, 346) for key in (0, 9)]
+
+
+def frame_of(detectors, cards=None):
+    """Extensions of two files, with the cards of each."""
+    each = [(f"e{i}", key, card) for i in (0, 1) for key, card in zip(detectors, cards or [{}] * 9, strict=False)]
+    return [replace(exposure(f"{e}-{key}", **card), exposure=e, detector=key) for e, key, card in each]
+
+
+@pytest.mark.parametrize(("theirs", "ours"), [("IM{}", "{}"), ("{}", "IM{}"), ("CCD0{}", "chip-{}")])
+def test_detectors_of_the_same_numbers_are_the_same(theirs, ours, caplog):
+    caplog.set_level("INFO", logger="legdistort")
+    ids = [ours.format(k) for k in (3, 1, 4, 2)]
+    found = of_files(frame_of([theirs.format(k) for k in (1, 2, 3, 4)]), ids)
+    wanted = [(f"e{i}-{ours.format(k)}", f"e{i}", ours.format(k)) for i in (0, 1) for k in (1, 2, 3, 4)]
+    assert [(each.name, each.exposure, each.detector) for each in found] == wanted
+    told = [text for text in caplog.messages if "by their numbers" in text]
+    assert len(told) == 1
+    assert f"detectors {theirs.format(1)}, {theirs.format(2)}" in told[0]
+
+
+@pytest.mark.parametrize(
+    ("detectors", "ids"),
+    [
+        (["IM1", "IM2", "IM3"], "1234"),
+        (["IM1", "IM2", "IM3", "IM4"], "123"),
+        (["IM0", "IM1", "IM2", "IM3"], "1234"),
+        (["A1", "B1", "A2", "B2"], "1234"),
+        (["IM1", "IM2", "IM3", "4"], "1234"),
+        (["A", "B"], "12"),
+    ],
+)
+def test_detectors_are_not_guessed(detectors, ids):
+    """One is missing, counted from another number, or has its number twice; or it has a name that is known."""
+    frames = frame_of(detectors)
+    assert [each.detector for each in of_files(frames, ids)] == detectors * 2
+    camera = legdistort.Camera(
+        "c", {k: legdistort.Detector((4, 4), layout=[[1, 0, 9 * int(k)], [0, 1, 0]]) for k in ids}
+    )
+    with pytest.raises(
+        InputError, match=r"is of detector .*, and camera c has .* give a camera whose ids are those of"
+    ):
+        camera.of_detectors(frames)
+
+
+def test_headers_that_name_detectors_go_before_numbers():
+    """Chips that are counted otherwise than extensions, as those of WFC3; and a version that all have alike."""
+    swapped = of_files(frame_of(["IM1", "IM2"], [{"CCDCHIP": 2}, {"CCDCHIP": 1}]), "12")
+    assert [each.detector for each in swapped] == ["2", "1"] * 2
+    alike = of_files(frame_of(["IM1", "IM2"], [{"EXTVER": 1}] * 2), "12")
+    assert [each.detector for each in alike] == ["1", "2"] * 2
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,10 @@
 """A run that goes on from what an earlier one has measured."""
 
+import dataclasses
 import shutil
 from pathlib import Path
 
+import header_layouts
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -12,9 +14,11 @@ import legdistort
 from legdistort import Solution
 from legdistort.cli.parser import main
 from legdistort.exceptions import InputError
+from legdistort.inputs.exposure_files import open_exposures
 from legdistort.measurement import positions
-from legdistort.measurement.earlier import EarlierRun
+from legdistort.measurement.earlier import EarlierRun, write_detections
 from legdistort.measurement.effective.sources import psf_from
+from legdistort.measurement.options import MeasureOptions
 
 pytestmark = [pytest.mark.filterwarnings("ignore::legdistort.LegdistortWarning"), pytest.mark.usefixtures("undrawn")]
 
@@ -95,10 +99,7 @@ def test_files_of_two_runs_are_refused(night, tmp_path, name):
         ({"psf": "moffat"}, "psf is not to be given with an earlier run"),
         ({"measuring": {"threshold": 4}}, "threshold is not to be given with an earlier run"),
         ({"ext": 1}, "ext is not to be given with an earlier run"),
-        (
-            {"camera": legdistort.Camera.gsaoi()},
-            r"or match \S*first/detections.ecsv with it .legdistort match --camera",
-        ),
+        ({"camera": legdistort.Camera.gsaoi()}, "the header of exp00 names none of the detectors 1, 2, 3, 4"),
         ({"earlier": "frames"}, "frames has no detections.ecsv: give the folder of the results of a run"),
         ({"earlier": None}, "give frames, or the folder of an earlier run"),
         ({"paths": ["frames/exp00.fits", "frames/other.fits"]}, "other.fits was not measured in .*first, whose frames"),
@@ -136,3 +137,32 @@ def test_a_table_of_somebody_else(night, tmp_path):
     table.write(tmp_path / "results" / "detections.ecsv")
     with pytest.raises(InputError, match=r"detections.ecsv is not what a run has left"):
         legdistort.run(out=tmp_path / "out", earlier=tmp_path / "results")
+
+
+def test_detectors_that_were_not_measured_are_named(night):
+    (exposure,) = open_exposures([night / "frames" / "exp00.fits"])
+    with pytest.raises(InputError, match="first has no positions of exp00-1: the camera does not name the detectors"):
+        EarlierRun.read(night / "first").of([dataclasses.replace(exposure, name="exp00-1")])
+
+
+@pytest.mark.slow
+def test_the_camera_of_another_night_goes_on_from_an_earlier_run(tmp_path):
+    """Frames of four detectors with positions as they were drawn, by a run whose camera is that of the headers."""
+    night, frames, first = header_layouts.Night(1, off=0.0, n=4, n_stars=150), tmp_path / "frames", tmp_path / "first"
+    frames.mkdir()
+    first.mkdir()
+    night.write(frames)
+    known = {"ext": "SCI", "measuring": MeasureOptions()}
+    exposures = open_exposures(sorted(frames.glob("*.fits")), ext="SCI")
+    write_detections(first / "detections.ecsv", night.table, exposures, first, **known)
+    camera = legdistort.Camera.of_frames(night.exposures)
+    asked = {"mosaic": False, "min_exposures": 2, "degree": 1, "earlier": first}
+    given = dataclasses.replace(camera, name="of last year")
+    out = tmp_path / "second"
+    assert legdistort.run(out=out, camera=given, **asked).solution.camera.name == "of last year" != camera.name
+    assert EarlierRun.read(out).camera.name == "of last year"
+    again = legdistort.run(out=tmp_path / "third", **asked | {"earlier": out}).solution  # without a word it stays
+    assert again.camera.name == "of last year"
+    other = dataclasses.replace(camera, detectors=dict(zip("ABCD", camera.detectors.values(), strict=True)))
+    with pytest.raises(InputError, match=r"e0-1 is of detector 1, and camera .* has A, B, C, D"):
+        legdistort.run(out=tmp_path / "fourth", camera=other, **asked)

@@ -421,8 +421,16 @@ def test_the_exposures_to_blame_are_named_the_worst_first():
     problem = SimpleNamespace(
         names=tuple("abcdef"), degree=2, unknowns=SimpleNamespace(spread=lambda vector: vector.reshape(6, 4))
     )
-    told = reduced_system._singular_message(problem, np.eye(24) - np.outer(direction, direction))
-    assert "above all in exposure c, f, b: leave out an exposure that hardly overlaps" in told
+    s, alike = np.eye(24) - np.outer(direction, direction), np.broadcast_to(np.eye(4), (6, 4, 4))
+    error = reduced_system._not_determined(problem, s, alike)
+    assert "above all in exposure c, f, b: leave out an exposure that hardly overlaps" in str(error)
+    assert error.exposures == ("c", "f", "b")
+    poor = np.where((np.arange(6) == 0)[:, None, None], np.ones((4, 4)) + 1e-5 * np.eye(4), alike)
+    error = reduced_system._not_determined(problem, s, poor)
+    assert "above all in exposure a: " in str(error)
+    assert error.exposures == ("a",)
+    shared = np.outer(np.full(6, 6**-0.5), np.ones(4) / 2).ravel()
+    assert reduced_system._not_determined(problem, np.eye(24) - np.outer(shared, shared), alike).exposures == ()
 
 
 @pytest.mark.parametrize("case", ["alike", "other weight in y", "correlated"])

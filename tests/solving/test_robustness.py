@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from astropy import units as u
-from astropy.table import vstack
+from astropy.table import QTable, vstack
 from caller_warnings import warns_here
 
 from legdistort import Matches, Prior, match, simulate_exposures, simulate_matches, solve
@@ -145,6 +145,47 @@ def test_three_outvote_three_that_do_not_agree():
 
 
 # --- stars -------------------------------------------------------------------------------------------------------
+
+
+def thin(seed, poor):
+    """Exposures of a cubic map by numpy alone; the stars of some of them are few, or on a line."""
+    rng, tables = RNG(seed), []
+    plane = rng.uniform(0, 2047, (60, 2))
+    if "line" in poor.values():
+        plane[:20, 0] = 200.0
+    for i in range(6):
+        z = plane / 1023.5 - 1
+        terms = np.stack([z[:, 0] ** a * z[:, 1] ** b for a in range(4) for b in range(4 - a) if a + b > 1], axis=1)
+        xy = plane + rng.uniform(-50, 50, 2) + terms @ rng.normal(0, 0.2, (7, 2)) + rng.normal(0, 0.02, (60, 2))
+        keep = np.ones(60, dtype=bool)
+        if (how := poor.get(f"e{i}")) == "few":
+            keep = np.arange(60) < 8
+        elif how == "line":
+            keep = np.arange(60) < 20
+        stars = np.flatnonzero(keep)
+        columns = {"x": xy[keep, 0] * u.pix, "y": xy[keep, 1] * u.pix}
+        columns |= dict.fromkeys(("x_err", "y_err"), np.full(len(stars), 0.02) * u.pix)
+        tables.append(QTable({"exposure": np.full(len(stars), f"e{i}"), "star": stars, **columns}))
+    return Matches.from_table(vstack(tables), shape=SHAPE)
+
+
+@pytest.mark.parametrize("poor", [{"e4": "few"}, {"e1": "few", "e4": "few"}, {"e2": "line"}])
+def test_exposures_of_few_stars_or_a_strip_do_not_cost_the_others(poor):
+    matches = thin(3, poor)
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        solution = solve(matches)
+    told = [str(each.message) for each in caught if "is left out" in str(each.message)]
+    assert set(solution.left_out) == set(poor)
+    assert [name for name in poor if any(f"exposure {name} is left out: its" in words for words in told)] == [*poor]
+    assert 0.8 < solution.chi2 / solution.dof < 1.2
+    check = {each.name: each for each in solution.checks}["rejection"]
+    assert (check.state, "--prior-sigma evidence" in check.cure) == ("warn", True)
+    assert "do not determine its distortion" in check.sentence
+
+
+def test_what_most_exposures_do_not_determine_is_no_fault_of_some():
+    with pytest.raises(SolveError, match="exposure e0 has 8 stars, fewer than the 10 modes of degree 3"):
+        solve(thin(3, dict.fromkeys(("e0", "e1", "e2"), "few")))
 
 
 def test_a_star_seen_twice_that_contradicts_itself_has_no_position():

@@ -88,6 +88,19 @@ def _numbers(view, values, known, unknown):
     return PoseNumbers(values, *(dict(zip(values, each, strict=True)) for each in (errors, changes)))
 
 
+def pose_variances(solution):
+    """Variances [pix^2, per axis at the corners of the detector] of rotation and scale of every exposure, as a list.
+
+    Of what each has by itself: errors of a map of all exposures together, which these share, are left out.
+    """
+    size = basis.n_modes(solution.degree)
+    if size < basis.n_modes(1):
+        return [0.0 for _ in solution]
+    rows = [similarity_basis(view.shape, size)[2:] for view in solution]
+    # a unit of a mode is 1/4 in mean square, and three times that at the corners
+    return [3 / 8 * float(np.trace(r @ view.covariance @ r.T)) for r, view in zip(rows, solution, strict=True)]
+
+
 def in_words(numbers):
     """How well the poses of exposures, a list of `PoseNumbers`, are known, in sentences; empty where that is not said.
 

@@ -15,6 +15,8 @@ GROSS_ERRORS = 0.05
 SEEN = 3.0
 #: What is said of exposures left out that agree with others of their night.
 ALIKE = "has another distortion"
+#: What is said of exposures left out that have too few stars, or stars in a corner.
+UNDETERMINED = "do not determine its distortion"
 #: Names in a sentence.
 MOST_NAMED = 6
 _SURELY = special.ndtri(0.95)

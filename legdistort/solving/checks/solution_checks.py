@@ -22,7 +22,7 @@ from .camera_check import camera_check, contradicted_layout, undetermined
 from .cures import with_cures, without_static
 from .dynamic_check import EVIDENCE, dynamic_check, nights_check, significance
 from .extrapolated_maps import extrapolation_check
-from .limits import ALIKE, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
+from .limits import ALIKE, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, UNDETERMINED, addition_that_shows, of_chi2
 from .prior_check import prior_check
 from .reference_check import reference_check
 from .residual_tests import Residuals
@@ -385,8 +385,10 @@ def rejection_check(solution):
         return Check("rejection", "fail" if share > 0.3 else "warn", share, GROSS_ERRORS, words,
                      "mismatches or blends: look at the exposures with most of them; match with a smaller --tolerance"
                      )  # fmt: skip
-    if any(why != ASKED for why in lost.values()):
-        return Check("rejection", "warn", share, GROSS_ERRORS, words, "look at these frames")
+    if odd := [why for why in lost.values() if why != ASKED]:
+        cure = "add exposures that overlap them, lower the degree, or give a prior with sigma (--prior-sigma evidence)"
+        cure = cure if all(UNDETERMINED in why for why in odd) else "look at these frames"
+        return Check("rejection", "warn", share, GROSS_ERRORS, words, cure)
     return Check("rejection", "pass", share, GROSS_ERRORS, words)
 
 

@@ -395,14 +395,15 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
     sigma[:, :, n_own:] = np.inf  # what exposures share does not scatter
     free = np.isinf(sigma).all(axis=(1, 2))
     needed = np.isinf(sigma[:, :, :n_own]).sum(axis=2).max(axis=1)
-    for name, count, n_free in zip(matches.names, counts, needed, strict=True):
-        if count < n_free:
-            raise SolveError(
-                f"exposure {name} has {count} stars, fewer than the {n_free} {'' if n_free == n_fit else 'free '}modes "
-                f"of degree {degree}: "
-                f"lower the degree (at most {_highest_degree(count)} here), give a prior with sigma, "
-                "or leave the exposure out"
-            )
+    if few := [i for i, count in enumerate(counts) if count < needed[i]]:
+        name, count, n_free = matches.names[few[0]], counts[few[0]], needed[few[0]]
+        raise SolveError(
+            f"exposure {name} has {count} stars, fewer than the {n_free} {'' if n_free == n_fit else 'free '}modes "
+            f"of degree {degree}: "
+            f"lower the degree (at most {_highest_degree(count)} here), give a prior with sigma, "
+            "or leave the exposure out (--without)",
+            exposures=tuple(matches.names[i] for i in few),
+        )
     has_widths, errors = not free.all(), StaticErrors.of(priors, degree)
     problem = Problem(
         degree=degree,

@@ -15,7 +15,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, eigh_tridiagonal, e
 from scipy.linalg.blas import dgemm, dtrsm
 from scipy.linalg.lapack import dpotri
 
-from ...exceptions import SolveError
+from ...exceptions import SolveError, some_of
 from . import elimination
 from .reduced_base import Reduced
 from .star_system import LEAST_PIVOT, OnStars
@@ -40,6 +40,9 @@ _ROUNDING = 1e-12  # of a variance, what is left where the constraints hold all 
 _SHOWN = 9.0  # squares that a common distortion which is held costs, in errors, from which the residuals show it
 _WEAK, _SURE = 0.3, 0.3  # eigenvalues below which directions are learnt, where they lack no more than this part of it
 _REMEMBERED = 100  # iterations, and directions
+#: Part of a direction that nothing determines from which it is of the exposures that are named; and least eigenvalue of
+#: an exposure with its stars known, beside that of the others, below which it is its own.
+_THEIRS, _MUCH_LESS = 0.6, 1e-3
 _NOTHING = 1e-9  # eigenvalue of the normalised equations that is rounding
 
 
@@ -56,15 +59,19 @@ def reduced_system(problem, blocks, gauge, weak=None):
 
 def is_singular(blocks):
     """Whether some block of an exposure (n, 2 n_modes, 2 n_modes) is singular, as where its stars lie on a line."""
-    blocks = elimination.of_one_axis(blocks)
-    unit = np.sqrt(np.einsum("iaa->ia", blocks))
-    if not unit.min() > 0:
-        return True
     try:
-        lower = np.linalg.cholesky(blocks / unit[:, :, None] / unit[:, None, :])
+        lower = np.linalg.cholesky(_normalised(blocks))
     except LinAlgError:
         return True
     return bool(np.einsum("iaa->ia", lower).min() < _LEAST_PIVOT)
+
+
+def _normalised(blocks):
+    """Blocks of exposures, of one axis where both are alike, with a unit diagonal, but for what nothing determines."""
+    blocks = elimination.of_one_axis(blocks)
+    diagonal = np.einsum("iaa->ia", blocks)
+    unit = np.sqrt(np.where(diagonal > 0, diagonal, 1))
+    return blocks / unit[:, :, None] / unit[:, None, :]
 
 
 def uses_direct(problem):
@@ -134,7 +141,7 @@ class Direct(Reduced):
             if np.diag(self._factor[0]).min() < _LEAST_PIVOT:
                 raise LinAlgError
         except (LinAlgError, ValueError):
-            raise SolveError(_singular_message(problem, s)) from None
+            raise _not_determined(problem, s, blocks.u) from None
         self._hold_rows()
 
     def _hold_rows(self):
@@ -285,15 +292,26 @@ class Direct(Reduced):
         return self.unknowns.covariance((out + out.T) / 2)
 
 
-def _singular_message(problem, s):
+def _not_determined(problem, s, blocks):
+    """The `SolveError` of a singular system, which names the exposures to blame, the worst first.
+
+    As `exposures` it has those whose own stars, even if these were known, determine far less than those of the others,
+    or those that have most of what is not determined.
+    """
     values, vectors = np.linalg.eigh(np.nan_to_num(s))
-    energy = (problem.unknowns.spread(vectors[:, 0]) ** 2).sum(axis=1)
-    worst = [problem.names[i] for i in np.argsort(energy)[::-1][:3] if energy[i] > 0.1]
-    return (
+    own = np.linalg.eigvalsh(np.nan_to_num(_normalised(blocks)))[:, 0]
+    blamed = theirs = [i for i in np.argsort(own) if own[i] < _MUCH_LESS * np.median(own)]
+    if not theirs:
+        energy = (problem.unknowns.spread(vectors[:, 0]) ** 2).sum(axis=1)
+        blamed = [i for i in np.argsort(energy)[::-1][:3] if energy[i] > 0.1]
+        theirs = blamed if energy[blamed].sum() > _THEIRS else []
+    worst = some_of([problem.names[i] for i in blamed], 3)
+    return SolveError(
         f"the observations do not determine the distortion of degree {problem.degree} "
-        f"(smallest eigenvalue {values[0]:.1e} of the normalised equations), above all in exposure {', '.join(worst)}: "
+        f"(smallest eigenvalue {values[0]:.1e} of the normalised equations), above all in exposure {worst}: "
         "leave out an exposure that hardly overlaps the others (--without), lower the degree, add stars, or give "
-        "a prior with sigma"
+        "a prior with sigma",
+        exposures=tuple(problem.names[i] for i in theirs),
     )
 
 
