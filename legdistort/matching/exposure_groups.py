@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import poisson
+from scipy.special import gammainc
 
 from ..geometry import similarity
 from ..measurement.flags import PERSISTS
@@ -181,7 +181,7 @@ def _is_crowded(places, at, radius, itself):
         return np.searchsorted(ordered, at + r, "right") - np.searchsorted(ordered, at - r)
 
     expected = np.maximum(within(BESIDE) - within(BREADTH), 1) * radius / (BESIDE - BREADTH)
-    return poisson.sf(within(radius) - itself - 1, expected) < CROWD
+    return gammainc(within(radius) - itself, expected) < CROWD  # of Poisson's law: so many or more
 
 
 def without(group, dropped):

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from ..measurement.flags import Flag
 from ..measurement.profiles.cutouts import Stamps
@@ -212,7 +212,7 @@ def _without(weight, flux, left_out):
 def _scatter(weight, flux, mean):
     """Whether fluxes (m, n) scatter by more than their errors; (n,)."""
     chi2, dof = (weight * (flux - mean) ** 2).sum(axis=0), np.maximum((weight > 0).sum(axis=0) - 1, 1)
-    return chi2 > np.maximum(_SCATTER * dof, chi2_distribution.isf(_CHANCE, dof))
+    return chi2 > np.maximum(_SCATTER * dof, chdtri(dof, _CHANCE))
 
 
 def image_flags(field):
