@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from astropy.table import Table
+from astropy.table import Table, vstack
 from numpy.polynomial import legendre
 from numpy.testing import assert_allclose
 
@@ -12,7 +12,7 @@ import legdistort as ld
 from legdistort.assessment.nights.camera_changes import CameraChanges
 from legdistort.assessment.nights.night_data import Night
 from legdistort.cli import main
-from legdistort.exceptions import InputError
+from legdistort.exceptions import AssumptionWarning, InputError
 
 SIZE, GAP = 512, 30
 STEP = SIZE + GAP
@@ -196,15 +196,8 @@ def test_the_plane_of_a_night_is_a_convention(two):
     assert np.abs(off_truth(moved.camera, drawn(1))[0]).max() > 4
 
 
-@pytest.mark.filterwarnings("ignore:. unknowns of camera PAIR are not determined")
 @pytest.mark.slow
 def test_what_cannot_be_added_is_refused(two):
-    exact = {"layout_sigma": None, "layout_covariance": None, "static_sigma": None}
-    chips = {key: replace(chip, **exact) for key, chip in two[0].camera.detectors.items()}
-    held = replace(two[0].camera, detectors=chips, common_sigma=None)
-    table, poses = night(101, drawn(1))
-    with pytest.raises(InputError, match=r"solution 3 .* PAIR .* layout='fit', static='fit' \(--layout fit"):
-        ld.combine_nights([*two, solved(table, poses, held, layout="hold")])
     with pytest.raises(InputError, match="solution 2 has an exposure that solution 1 has too"):
         ld.combine_nights([two[0], two[0]])
     with pytest.raises(InputError, match=r"solution 1 is of camera PAIR .* leave the covariate out"):
@@ -214,13 +207,76 @@ def test_what_cannot_be_added_is_refused(two):
         ld.combine_nights([*two, single])
 
 
+@pytest.fixture(scope="module")
+def third():
+    """Table and poses of a night, and its solution with everything of the camera fitted."""
+    given = night(102, drawn(1), exposures=4, year=2015.0)
+    return given, solved(*given)
+
+
+def same_camera(found, known, *, part):
+    """Whether two combinations differ by less than a part of the errors, and these by less than it."""
+    (values, covariance), (others, theirs) = found.static(), known.static()
+    error, other = (np.sqrt(np.diag(each)) for each in (covariance, theirs))
+    assert np.all(np.abs(values - others).ravel() < part * other + 1e-9)
+    assert_allclose(error, other, rtol=part, atol=1e-9)
+
+
+def without_errors(known):
+    """The camera of a solution, as if it were exact."""
+    none = dict.fromkeys(("layout_sigma", "layout_covariance", "static_sigma", "static_covariance"))
+    chips = {key: replace(chip, **none) for key, chip in known.detectors.items()}
+    return replace(known, detectors=chips, common_sigma=None, covariance=None)
+
+
+@pytest.mark.parametrize("how", ["layout None", "layout held", "all held", "nominal held", "prior"])
+@pytest.mark.filterwarnings("ignore:. unknowns of camera PAIR are not determined")
+@pytest.mark.filterwarnings("ignore:.*checks")
 @pytest.mark.slow
-def test_what_was_known_beforehand_is_refused(two):
-    """It would count in every night."""
-    known = ld.combine_nights(two).camera()
-    table, poses = night(7, drawn(1), exposures=4)
-    with pytest.raises(InputError, match="known beforehand: nights add what they find by themselves"):
-        ld.combine_nights([*two, solved(table, poses, known, layout=None, static=None)])
+def test_a_night_counts_by_its_own_data(two, third, how, recwarn):
+    """Whatever was held, or known beforehand, it counts as the same night with all of the camera fitted."""
+    (table, poses), free = third
+    stated = {
+        key: ld.Detector((SIZE, SIZE), layout=each.layout, layout_sigma=np.inf)
+        for key, each in camera().detectors.items()
+    }
+    given, words = {
+        "layout None": (ld.Camera("PAIR", stated), {"layout": None}),
+        "layout held": (without_errors(two[0].camera), {"layout": "hold"}),
+        "all held": (without_errors(two[0].camera), {"layout": "hold", "static": "hold"}),
+        "nominal held": (camera(), {"layout": "hold", "static": "hold"}),
+        "prior": (ld.combine_nights(two).camera(), {"layout": None, "static": None}),
+    }[how]
+    other = solved(table, poses, given, **words)
+    recwarn.clear()
+    same_camera(ld.combine_nights([*two, other]), ld.combine_nights([*two, free]), part=0.01)
+    assert not recwarn
+
+
+@pytest.mark.filterwarnings("ignore:. unknowns of camera PAIR are not determined")
+@pytest.mark.slow
+def test_nights_of_one_solution_count_one_by_one(two, third):
+    """Each is what it is where it is solved by itself; one of a single exposure is left out."""
+    of, tables, poses = drawn(1), [], {}
+    given = [night(100 + i, of, exposures=4, year=2014 + i / 2) for i in range(2)]
+    for i, (table, those) in enumerate([*given, third[0], night(103, of, exposures=1, year=2016.0)]):
+        table = table.copy()
+        table["exposure"] = [f"n{i}{name}" for name in table["exposure"]]
+        table["star"] += 1000 * i
+        poses |= {f"n{i}{name}": pose for name, pose in those.items()}
+        tables.append(table)
+    together = solved(vstack(tables), poses)
+    with pytest.warns(AssumptionWarning, match=r"^2016-01-01 of solution 1 left out: one exposure alone"):
+        found = ld.combine_nights(together)
+    assert [each.name for each in found.nights] == [
+        f"{y} of solution 1" for y in ("2014-01-01", "2014-07-02", "2015-01-01")
+    ]
+    same_camera(found, ld.combine_nights([*two, third[1]]), part=0.01)
+    with (
+        pytest.warns(AssumptionWarning),
+        pytest.raises(InputError, match=r"2015-01-01 of solution 2 has an exposure that solution 1 has too"),
+    ):
+        ld.combine_nights([third[1], together])
 
 
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.ConvergenceWarning")
