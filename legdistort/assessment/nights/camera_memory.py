@@ -118,10 +118,6 @@ class CombinedNights(ShownAsPrinted):
         """Whether the camera has several detectors, in a focal plane."""
         return self.nights[0].camera is not None
 
-    def _check_single(self, cure):
-        if self.has_focal_plane:
-            raise InputError(f"camera {self.name} has several detectors, and no single distortion: {cure}")
-
     def _year(self, date):
         return float(self.dates.max() if date is None else epochs.year(date))
 
@@ -240,7 +236,11 @@ class CombinedNights(ShownAsPrinted):
         InputError
             Of a camera with several detectors.
         """
-        self._check_single("take its camera, camera() (--camera)")
+        if self.has_focal_plane:
+            raise InputError(
+                f"camera {self.name} has several detectors, and no single distortion: take its camera, camera() "
+                "(--camera)"
+            )
         static, covariance = self.static(date, value, further_night=True)
         record = {"kind": "nights", "name": self.name, "nights": len(self.nights)}
         known = Prior(static, static_covariance=covariance, shape=self.shape, source=record)
@@ -387,8 +387,7 @@ class CombinedNights(ShownAsPrinted):
         return named | sizes | {"modes": records(self.modes(date, value)), "nights": records(self.table)}
 
     def plot(self, *, fig: Figure | None = None) -> Figure:
-        """Coefficients of one detector against time, see `legdistort.plots.memory_plots.plot_memory`."""
-        self._check_single("its coefficients are not drawn (leave --plot out), a picture of it is camera().plot()")
+        """Coefficients against time, see `legdistort.plots.memory_plots.plot_memory`."""
         return plot_memory(self, fig=fig)
 
     @plain_numbers
