@@ -14,6 +14,7 @@ from legdistort.assessment.nights.night_data import Night
 from legdistort.cli import main
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.plots import memory_plots
+from legdistort.solving import camera_fit
 
 SIZE, GAP = 512, 30
 STEP = SIZE + GAP
@@ -167,8 +168,6 @@ def test_nights_of_two_detectors_make_one_camera(two, tmp_path):
     assert len(combined.modes()) == 12
     with pytest.raises(InputError, match=r"camera PAIR has several detectors, .*: take its camera, camera\(\)"):
         combined.prior()
-    with pytest.raises(InputError, match=r"not drawn \(leave --plot out\)"):
-        combined.plot()
     path = combined.write(tmp_path / "camera.asdf")
     again, read = ld.CombinedNights.read(path), ld.Camera.read(path)
     assert_allclose(again.static()[0], found, atol=1e-12)
@@ -278,6 +277,17 @@ def test_nights_of_one_solution_count_one_by_one(two, third):
         pytest.raises(InputError, match=r"2015-01-01 of solution 2 has an exposure that solution 1 has too"),
     ):
         ld.combine_nights([third[1], together])
+
+
+@pytest.mark.parametrize(("seed", "number", "most"), [(2, 0, 13), (0, 1, 20)])
+@pytest.mark.slow
+def test_a_camera_settles_where_the_focal_plane_is_hardly_determined(seed, number, most, monkeypatch):
+    """Half steps to the end took 18 steps, and directions that are determined in every other step 27."""
+    steps, step = [], camera_fit.camera_step
+    monkeypatch.setattr(camera_fit, "camera_step", lambda *given: steps.append(step(*given)) or steps[-1])
+    solved(*night(100 * seed + number, drawn(seed), year=2014 + number / 2, nightly=0.02))
+    assert steps[-1].length < 0.01
+    assert len(steps) <= most
 
 
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.ConvergenceWarning")
