@@ -8,7 +8,7 @@ from scipy import special
 
 from ..cameras.camera import Camera
 from ..cameras.detector import map_alone, maps_of_plane, widths_alone
-from ..cameras.stated_errors import FREE
+from ..cameras.stated_errors import FREE, resized
 from ..exceptions import InputError
 from ..geometry import basis, detector_modes
 from ..geometry.distortion import Distortion
@@ -133,7 +133,9 @@ def _of_camera(camera, label, common=None, covariance=None):
     elif any(each is not None for each in widths):
         widths = [widths_alone(each, statics[key].shape[1]) for key, each in camera.detectors.items()]
         alone = np.diag(np.concatenate([np.minimum(each.ravel(), NOTHING) ** 2 for each in widths]))
-        covariance = alone if joint is None else joint
+        if joint is None and len({each.shape for each in widths}) == 1:
+            joint = resized(camera.covariance, widths[0].shape[1], 2 * len(widths))
+        covariance = alone if joint is None else np.where(np.isinf(joint), NOTHING**2, joint)
         if n:
             maps = [maps_of_plane(each, camera.field, n).reshape(2, n, -1) for each in camera.detectors.values()]
             whole = [np.pad(each, ((0, 0), (0, max(w.shape[1] - n, 0)), (0, 0)))[:, : w.shape[1]]

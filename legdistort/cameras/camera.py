@@ -104,7 +104,7 @@ class Camera(ShownAsPrinted):
         Covariance of layouts (orders 0 and 1) and static distortions of all detectors, one after the other, modes of x
         first, px^2, as `legdistort.solve` finds it. Its diagonal are the squares of `layout_sigma` and `static_sigma`
         of the detectors; where these have been changed since, it is left out (None). A prior has it for the next
-        exposures. None: all modes count as independent.
+        exposures, and `correct_table` for errors. None: all modes count as independent.
 
     Raises
     ------

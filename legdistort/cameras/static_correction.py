@@ -16,7 +16,7 @@ from ..geometry import basis, detector_modes, similarity
 from ..geometry.distortion import Distortion
 from ..inputs import column_contract
 from .detector import moved_by
-from .stated_errors import FREE, StaticSpread, as_widths
+from .stated_errors import FREE, StaticSpread, as_widths, resized
 
 #: Beyond its edge by more [pix] a position is off a detector, and by this part of a side the series means nothing.
 _BEYOND, _FAR = 1.0, 0.1
@@ -38,7 +38,7 @@ def correct_table(camera, table, sigma=None, rest=None):
     f, relative, absolute, moved = np.empty_like(xy), *np.empty((2, len(xy), 2, 2)), np.empty((2, len(xy)))
     for key in np.unique(detector):
         rows = detector == key
-        f[rows], parts = _corrected(camera, camera[key], xy[rows], measured[rows], sigma, rest)
+        f[rows], parts = _corrected(camera, key, xy[rows], measured[rows], sigma, rest)
         relative[rows], absolute[rows], moved[:, rows] = parts
     return _as_table(camera, table, f, relative, absolute, moved)
 
@@ -75,11 +75,12 @@ def _check_on_detectors(camera, xy, detector):
     warn(f"{said}; the correction is extrapolated there", AssumptionWarning)
 
 
-def _corrected(camera, detector, xy, measured, sigma, rest):
+def _corrected(camera, key, xy, measured, sigma, rest):
     """Places (n, 2) in the focal plane of pixels of a detector, relative and absolute covariance (n, 2, 2), variances.
 
     The last, (2, n), are the means per axis by the static distortion and by the departure of an exposure.
     """
+    detector = camera[key]
     distortion = detector.distortion if rest is None else replace(detector.distortion, table=rest)
     distortion.check_fold()
     q = distortion.invert(xy)
@@ -92,7 +93,7 @@ def _corrected(camera, detector, xy, measured, sigma, rest):
         through = np.linalg.inv(plane.jacobian(f)) @ through
     if camera.common_sigma is not None:
         shared = _by_modes(f, camera.field, camera.common_sigma)
-    own = _by_detector(camera, detector, q)
+    own = _by_detector(camera, key, q)
     base = with_scatter = through @ measured @ through.mT
     if sigma is not None:
         n = np.shape(sigma)[-1] if np.ndim(sigma) else detector.static.shape[1]
@@ -115,18 +116,26 @@ def _by_modes(f, shape, sigma):
     return through, detector_modes.row_variances(rows, sigma.ravel())
 
 
-def _by_detector(camera, detector, q):
+def _by_detector(camera, key, q):
     """The same by errors of the static distortion of a detector and, in a focal plane, of its layout."""
+    detector = camera[key]
     n = detector.static.shape[1]
-    covariance = _covariance(detector.static_covariance, detector.static_sigma, n)
-    rows = detector_modes.dynamic_basis(detector.shape, n)
-    if camera.has_focal_plane:
+    covariance, rows = _covariance(detector.static_covariance, detector.static_sigma, n), None
+    if not camera.has_focal_plane:
+        rows = detector_modes.dynamic_basis(detector.shape, n)
+    elif camera.covariance is not None:
+        n = max(n, 3)
+        place, size = list(camera.detectors).index(key), len(camera.covariance) // len(camera.detectors)
+        own = slice(size * place, size * (place + 1))
+        covariance = resized(camera.covariance[own, own], n)
+    else:
         n = max(n, 3)
         whole = np.zeros((2, n, 2, n))
         whole[:, 3:, :, 3:] = np.zeros((2, 0, 2, 0)) if n == 3 else covariance.reshape(2, n, 2, n)[:, 3:, :, 3:]
         layout = _covariance(detector.layout_covariance, detector.layout_sigma, 3)
         whole[:, :3, :, :3] = layout.reshape(2, 3, 2, 3)
-        covariance, rows = whole.reshape(2 * n, 2 * n), np.eye(2 * n)
+        covariance = whole.reshape(2 * n, 2 * n)
+    rows = np.eye(2 * n) if rows is None else rows
     spread = StaticSpread.of(rows[None], np.zeros((1, 2 * n)), [covariance])
     directions, variance = spread.directions[0], spread.variance[0]
     return moved_by(detector, q, (rows.T @ directions).reshape(2, n, -1)), variance

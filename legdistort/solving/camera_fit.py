@@ -51,6 +51,9 @@ _CLEAR = 10.0
 _SAME = 1e-6
 #: Steps at most, and their length in standard errors at which they end.
 _STEPS, _SMALL = 20, 0.01
+#: Steps after which directions that are not determined stay the same. One that is at the limit was so in every other
+#: step, went back to where it was beforehand, and fits wandered on.
+_CHOOSING = 5
 #: Part of a step by which the next one must take it back for half steps to be better.
 _BACK = 0.5
 
@@ -74,6 +77,8 @@ class CameraStep:
         Number of changes that the data determine rather than what was known.
     weak : ndarray, shape (m, k)
         Directions that are not determined.
+    undetermined : ndarray, shape (m, r)
+        The same by the numbers of `Sought.root`.
     """
 
     change: np.ndarray
@@ -83,6 +88,7 @@ class CameraStep:
     response: np.ndarray
     freedom: float
     weak: np.ndarray
+    undetermined: np.ndarray
 
     @property
     def errors(self):
@@ -225,12 +231,14 @@ class CameraFit:
                 return matches
             sought = Sought(free, np.full(free.shape, np.inf))
         part, last = 1.0, np.zeros(sought.free.shape)
-        for _ in range(_STEPS):
+        for number in range(_STEPS):
             with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):  # the fit that comes last warns
                 fit = self.join(estimate(matches))
-            self.step = camera_step(fit, sought, self._departure, self._stated)
+            held = self.step.undetermined if number >= _CHOOSING else None
+            self.step = camera_step(fit, sought, self._departure, self._stated, held)
             # exposures give way to a change that they can undo, and then it comes back: half of it does not
-            part = 0.5 if np.vdot(last, self.step.change) < -_BACK * np.vdot(last, last) else part
+            comes_back = np.vdot(last, self.step.change) < -_BACK * np.vdot(last, last)
+            part = part / 2 if comes_back else min(1.0, 2 * part)
             last = part * self.step.change
             self._departure = self._departure + last
             try:
@@ -487,7 +495,7 @@ def in_camera(matches, camera):
     return replace(matches, table=table, camera=camera)
 
 
-def camera_step(fit, sought, departure, stated=False):
+def camera_step(fit, sought, departure, stated=False, undetermined=None):
     """The `CameraStep` that a `Fit` calls for.
 
     Parameters
@@ -498,6 +506,8 @@ def camera_step(fit, sought, departure, stated=False):
         Of the camera from where it was beforehand.
     stated : ndarray of bool, shape (n_detectors,)
         Those whose headers nothing contradicts: what is not determined of them stays as these state it.
+    undetermined : ndarray, shape (m, r), optional
+        What counts as not determined, as `CameraStep` has it; by default what the fit does not determine.
     """
     free, root = sought.free, sought.root
     patterns = _patterns(fit.matches, fit.matches.camera, fit.weighted, free)
@@ -505,15 +515,16 @@ def camera_step(fit, sought, departure, stated=False):
     precision, before = sought.stated.astype(float), sought.numbers @ departure[free]
     normal, pull = _told(fit, follow, free)
     pull = root.T @ pull - precision * before
-    half, weak = _root_of_inverse(root.T @ normal @ root, precision, np.einsum("kr,kl,lr->r", root, follow.alone, root))
-    weak = weak @ root.T
+    alone = np.einsum("kr,kl,lr->r", root, follow.alone, root)
+    half, undetermined = _root_of_inverse(root.T @ normal @ root, precision, alone, undetermined)
+    weak = undetermined @ root.T
     held = held_changes(weak, change_weights(free, stated), _slides(fit, free, weak))
     change = np.zeros(free.shape)
     change[free] = held @ root @ (before + half @ (half.T @ pull)) - departure[free]
     known = held @ root @ half
     covariance = known @ known.T
     freedom = float(np.sum(covariance * normal))
-    return CameraStep(change, covariance, free, follow.stars[:2], follow.coefficients, freedom, weak)
+    return CameraStep(change, covariance, free, follow.stars[:2], follow.coefficients, freedom, weak, undetermined)
 
 
 def _patterns(matches, camera, problem, free):
@@ -546,17 +557,22 @@ def _told(fit, follow, free):
     return scaled / np.outer(unit, unit), left @ (unit * follow.pull) / unit
 
 
-def _root_of_inverse(normal, precision, alone):
+def _root_of_inverse(normal, precision, alone, weak=None):
     """R of the inverse R R' of the sum, (k, n), on what data or prior determine; directions (m, k) that neither does.
 
-    `alone` (k,) is what the data would determine of each unknown if all others were known.
+    `alone` (k,) is what the data would determine of each unknown if all others were known. Directions `weak` (m, k), if
+    they are given, are those.
     """
     unit = 1 / np.sqrt(alone + precision)
-    values, vectors = np.linalg.eigh(normal * np.outer(unit, unit) + np.diag(precision > 0))
-    good = values > _WEAK
-    known = vectors[:, good] * unit[:, None]
+    if weak is None:
+        values, vectors = np.linalg.eigh(normal * np.outer(unit, unit) + np.diag(precision > 0))
+        good = values > _WEAK
+        weak = (vectors[:, ~good] * unit[:, None]).T
+        known = vectors[:, good] * unit[:, None]
+    else:
+        known = np.linalg.qr((weak / unit).T, mode="complete")[0][:, len(weak) :] * unit[:, None]
     root = np.linalg.cholesky(known.T @ (normal + np.diag(precision)) @ known)
-    return solve_triangular(root, known.T, lower=True).T, (vectors[:, ~good] * unit[:, None]).T
+    return solve_triangular(root, known.T, lower=True).T, weak
 
 
 def _slides(fit, free, weak):

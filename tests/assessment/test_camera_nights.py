@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from astropy.table import Table
+from astropy.table import Table, vstack
 from numpy.polynomial import legendre
 from numpy.testing import assert_allclose
 
@@ -12,7 +12,9 @@ import legdistort as ld
 from legdistort.assessment.nights.camera_changes import CameraChanges
 from legdistort.assessment.nights.night_data import Night
 from legdistort.cli import main
-from legdistort.exceptions import InputError
+from legdistort.exceptions import AssumptionWarning, InputError
+from legdistort.plots import memory_plots
+from legdistort.solving import camera_fit
 
 SIZE, GAP = 512, 30
 STEP = SIZE + GAP
@@ -166,8 +168,6 @@ def test_nights_of_two_detectors_make_one_camera(two, tmp_path):
     assert len(combined.modes()) == 12
     with pytest.raises(InputError, match=r"camera PAIR has several detectors, .*: take its camera, camera\(\)"):
         combined.prior()
-    with pytest.raises(InputError, match=r"not drawn \(leave --plot out\)"):
-        combined.plot()
     path = combined.write(tmp_path / "camera.asdf")
     again, read = ld.CombinedNights.read(path), ld.Camera.read(path)
     assert_allclose(again.static()[0], found, atol=1e-12)
@@ -196,15 +196,8 @@ def test_the_plane_of_a_night_is_a_convention(two):
     assert np.abs(off_truth(moved.camera, drawn(1))[0]).max() > 4
 
 
-@pytest.mark.filterwarnings("ignore:. unknowns of camera PAIR are not determined")
 @pytest.mark.slow
 def test_what_cannot_be_added_is_refused(two):
-    exact = {"layout_sigma": None, "layout_covariance": None, "static_sigma": None}
-    chips = {key: replace(chip, **exact) for key, chip in two[0].camera.detectors.items()}
-    held = replace(two[0].camera, detectors=chips, common_sigma=None)
-    table, poses = night(101, drawn(1))
-    with pytest.raises(InputError, match=r"solution 3 .* PAIR .* layout='fit', static='fit' \(--layout fit"):
-        ld.combine_nights([*two, solved(table, poses, held, layout="hold")])
     with pytest.raises(InputError, match="solution 2 has an exposure that solution 1 has too"):
         ld.combine_nights([two[0], two[0]])
     with pytest.raises(InputError, match=r"solution 1 is of camera PAIR .* leave the covariate out"):
@@ -214,13 +207,87 @@ def test_what_cannot_be_added_is_refused(two):
         ld.combine_nights([*two, single])
 
 
+@pytest.fixture(scope="module")
+def third():
+    """Table and poses of a night, and its solution with everything of the camera fitted."""
+    given = night(102, drawn(1), exposures=4, year=2015.0)
+    return given, solved(*given)
+
+
+def same_camera(found, known, *, part):
+    """Whether two combinations differ by less than a part of the errors, and these by less than it."""
+    (values, covariance), (others, theirs) = found.static(), known.static()
+    error, other = (np.sqrt(np.diag(each)) for each in (covariance, theirs))
+    assert np.all(np.abs(values - others).ravel() < part * other + 1e-9)
+    assert_allclose(error, other, rtol=part, atol=1e-9)
+
+
+def without_errors(known):
+    """The camera of a solution, as if it were exact."""
+    none = dict.fromkeys(("layout_sigma", "layout_covariance", "static_sigma", "static_covariance"))
+    chips = {key: replace(chip, **none) for key, chip in known.detectors.items()}
+    return replace(known, detectors=chips, common_sigma=None, covariance=None)
+
+
+@pytest.mark.parametrize("how", ["layout None", "layout held", "all held", "nominal held", "prior"])
+@pytest.mark.filterwarnings("ignore:. unknowns of camera PAIR are not determined")
+@pytest.mark.filterwarnings("ignore:.*checks")
 @pytest.mark.slow
-def test_what_was_known_beforehand_is_refused(two):
-    """It would count in every night."""
-    known = ld.combine_nights(two).camera()
-    table, poses = night(7, drawn(1), exposures=4)
-    with pytest.raises(InputError, match="known beforehand: nights add what they find by themselves"):
-        ld.combine_nights([*two, solved(table, poses, known, layout=None, static=None)])
+def test_a_night_counts_by_its_own_data(two, third, how, recwarn):
+    """Whatever was held, or known beforehand, it counts as the same night with all of the camera fitted."""
+    (table, poses), free = third
+    stated = {
+        key: ld.Detector((SIZE, SIZE), layout=each.layout, layout_sigma=np.inf)
+        for key, each in camera().detectors.items()
+    }
+    given, words = {
+        "layout None": (ld.Camera("PAIR", stated), {"layout": None}),
+        "layout held": (without_errors(two[0].camera), {"layout": "hold"}),
+        "all held": (without_errors(two[0].camera), {"layout": "hold", "static": "hold"}),
+        "nominal held": (camera(), {"layout": "hold", "static": "hold"}),
+        "prior": (ld.combine_nights(two).camera(), {"layout": None, "static": None}),
+    }[how]
+    other = solved(table, poses, given, **words)
+    recwarn.clear()
+    same_camera(ld.combine_nights([*two, other]), ld.combine_nights([*two, free]), part=0.01)
+    assert not recwarn
+
+
+@pytest.mark.filterwarnings("ignore:. unknowns of camera PAIR are not determined")
+@pytest.mark.slow
+def test_nights_of_one_solution_count_one_by_one(two, third):
+    """Each is what it is where it is solved by itself; one of a single exposure is left out."""
+    of, tables, poses = drawn(1), [], {}
+    given = [night(100 + i, of, exposures=4, year=2014 + i / 2) for i in range(2)]
+    for i, (table, those) in enumerate([*given, third[0], night(103, of, exposures=1, year=2016.0)]):
+        table = table.copy()
+        table["exposure"] = [f"n{i}{name}" for name in table["exposure"]]
+        table["star"] += 1000 * i
+        poses |= {f"n{i}{name}": pose for name, pose in those.items()}
+        tables.append(table)
+    together = solved(vstack(tables), poses)
+    with pytest.warns(AssumptionWarning, match=r"^2016-01-01 of solution 1 left out: one exposure alone"):
+        found = ld.combine_nights(together)
+    assert [each.name for each in found.nights] == [
+        f"{y} of solution 1" for y in ("2014-01-01", "2014-07-02", "2015-01-01")
+    ]
+    same_camera(found, ld.combine_nights([*two, third[1]]), part=0.01)
+    with (
+        pytest.warns(AssumptionWarning),
+        pytest.raises(InputError, match=r"2015-01-01 of solution 2 has an exposure that solution 1 has too"),
+    ):
+        ld.combine_nights([third[1], together])
+
+
+@pytest.mark.parametrize(("seed", "number", "most"), [(2, 0, 13), (0, 1, 20)])
+@pytest.mark.slow
+def test_a_camera_settles_where_the_focal_plane_is_hardly_determined(seed, number, most, monkeypatch):
+    """Half steps to the end took 18 steps, and directions that are determined in every other step 27."""
+    steps, step = [], camera_fit.camera_step
+    monkeypatch.setattr(camera_fit, "camera_step", lambda *given: steps.append(step(*given)) or steps[-1])
+    solved(*night(100 * seed + number, drawn(seed), year=2014 + number / 2, nightly=0.02))
+    assert steps[-1].length < 0.01
+    assert len(steps) <= most
 
 
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.ConvergenceWarning")
@@ -246,6 +313,36 @@ def test_a_night_is_compared_with_the_camera_of_others(tmp_path):
     combined.write(tmp_path / "camera.asdf")
     assert ld.difference(tmp_path / "camera.asdf", nights[3]).agrees
     assert ld.difference(combined, nights[0]).shared == nights[0].names
+    one, other = (ld.difference(each, nights[3]) for each in (combined, combined.camera()))
+    assert one.chi2 == pytest.approx(other.chi2, rel=1e-6)  # modes that counted as independent had another
+
+
+def test_coefficients_of_all_detectors_are_drawn(monkeypatch):
+    """Two rows a detector, a panel each order; nights that hardly tell have no point; those that change most."""
+    monkeypatch.setattr(memory_plots, "_MOST", 2)
+    rng, nights = np.random.default_rng(1), []
+    for i in range(3):
+        chips = {}
+        for key, chip in camera(3).detectors.items():
+            static = np.where(np.arange(6) < 3, 0, rng.normal(0, 0.05, (2, 6)) + 0.5 * i * (key == "2"))
+            chips[key] = replace(chip, static=static)
+        night = replace(measured(chips), name=f"n{i}", date=2020.0 + i)
+        information = 1e4 * np.eye(36) if i < 2 else 1e-2 * np.eye(36)
+        nights.append(replace(night, information=information, pull=np.zeros(36)))
+    sizes = {"scatter": np.full(3, 0.05), "oddness": np.ones(3)}
+    found = ld.CombinedNights(tuple(nights), shape=(SIZE, SIZE), name="ROW", **sizes)
+    fig = found.plot()
+    assert len(fig.axes) == 2 * 2 * 6
+    assert fig.axes[-6].get_ylabel() == "detector 2\nalong y [pix]"
+    assert [ax.get_title(loc="left") for ax in fig.axes[:3]] == ["L0 L0", "L1 L0", "L0 L1"]
+    *_, last = fig.axes[-12:-6]  # of detector 2 along x, y^2
+    points = [each.lines[0].get_xydata()[0] for each in last.containers]
+    values = found.static()[0]
+    assert [x for x, _ in points] == [2020, 2021]
+    assert points[1][1] == pytest.approx(found.seen_by(1)[0][2, 0, 5])
+    assert abs(points[1][1] - points[0][1]) > 0.2
+    assert last.lines[0].get_ydata()[0] == pytest.approx(values[2, 0, 5])
+    assert fig.axes[-1].get_xlabel() == "year"
 
 
 @pytest.mark.slow
@@ -253,12 +350,11 @@ def test_the_command(two, tmp_path, capsys):
     for i, each in enumerate(two):
         each.write(tmp_path / f"night{i}.asdf")
     first, whole = tmp_path / "first.asdf", tmp_path / "camera.asdf"
-    drawn_too = ["--out", str(first), "--plot", str(tmp_path / "a.png"), "--quiet"]
-    assert main(["nights", str(tmp_path / "night0.asdf"), *drawn_too]) == 1
-    assert "leave --plot out" in capsys.readouterr().err
-    assert not first.exists()
     assert main(["nights", str(tmp_path / "night0.asdf"), "--out", str(first), "--name", "PAIR", "--quiet"]) == 0
-    assert main(["nights", str(first), str(tmp_path / "night1.asdf"), "--out", str(whole), "--quiet"]) == 0
+    picture = tmp_path / "a.png"
+    line = ["nights", str(first), str(tmp_path / "night1.asdf"), "--out", str(whole), "--plot", str(picture), "--quiet"]
+    assert main(line) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
     assert "detector axis x_degree" in capsys.readouterr().out
     assert_allclose(
         ld.CombinedNights.read(whole).static()[0], ld.combine_nights(two, name="PAIR").static()[0], atol=1e-9

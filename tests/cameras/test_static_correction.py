@@ -149,6 +149,34 @@ def test_errors_of_several_detectors_are_those_of_drawn_truth():
     assert np.all(xy_of(made, "_err") < xy_of(made, "_err_abs"))
 
 
+def test_what_modes_of_a_detector_have_in_common_counts():
+    """A shift of its place against x^2, and a shear against y^3, cancel over a half of it: drawn truth, in numpy."""
+    rng, widths = np.random.default_rng(7), np.where(np.arange(10) < 3, 0.05, 0.04) * np.ones((2, 2, 1))
+    root = np.diag(widths.ravel())
+    for one, other in ((20, 23), (32, 39)):  # of detector b
+        root[other] = 0.0
+        root[other, one] = -0.04
+    covariance, (a, b) = root @ root.T, pair().detectors.values()
+    known = {"static_sigma": np.where(np.arange(10) < 3, 0, 0.04) * np.ones((2, 1)), "layout_sigma": 0.05}
+    chips = {"a": ld.Detector(SHAPE, static=a.static, **known)}
+    chips["b"] = ld.Detector(SHAPE, layout=b.layout, static=b.static, **known)
+    whole = ld.Camera("pair", chips, covariance=covariance)
+    assert whole.covariance is not None
+    q, off = places(40), []
+    f = (q - whole["b"].layout[:, 2]) @ np.linalg.inv(whole["b"].layout[:, :2]).T
+    for _ in range(200):
+        change = (root @ rng.normal(size=len(root))).reshape(2, 2, 10)[1]
+        there = distort(q, change[:, :3])
+        seen = distort(there, whole["b"].static + np.where(np.arange(10) < 3, 0, change))
+        made = whole.correct_table(listed(seen, 1e-6, detector=np.full(40, "b")))
+        off.append(xy_of(made) - f)
+    ratio = np.mean(np.array(off) ** 2, axis=0) / xy_of(made, "_err") ** 2
+    assert np.mean(ratio) == pytest.approx(1, abs=0.05)
+    assert np.std(ratio) < 0.2
+    apart = ld.Camera("pair", whole.detectors).correct_table(listed(seen, 1e-6, detector=np.full(40, "b")))
+    assert np.min(xy_of(made, "_err") / xy_of(apart, "_err")) < 0.85
+
+
 def test_without_errors_those_of_the_correction_alone():
     whole, some = (camera(static_sigma=0.05).correct_table(listed(places(9), e), sigma=0.1) for e in (0.03, None))
     assert_allclose(xy_of(whole, "_err") ** 2 - xy_of(some, "_err") ** 2, 0.03**2, rtol=0.05)

@@ -188,25 +188,6 @@ def shown_of_camera(solution, label):
     Maps of the focal plane that detectors and exposures share have no information, nor has what is held.
     """
     errors, camera = solution.estimate.uncertainty.camera, solution.camera
-    settings = solution.settings
-    if errors is None or errors.departure is not None or not settings.layout == settings.static == "fit":
-        raise InputError(
-            f"{label} is of camera {camera.name} with several detectors, whose layout or static distortions were held, "
-            "or known beforehand: nights add what they find by themselves, so solve it with layout='fit', "
-            "static='fit' (--layout fit --static fit)"
-        )
-    if len(camera.detectors) < 2:
-        raise InputError(
-            f"{label} is of camera {camera.name}, one detector in a focal plane, whose distortions exposures can take "
-            "over: solve its exposures as images without a camera"
-        )
-    if errors.unsettled:
-        raise InputError(f"{label} did not settle (check camera), and its errors do not hold: leave it out")
-    if len(solution.nights) > 1:
-        raise InputError(
-            f"{label} has {len(solution.nights)} nights of a camera with several detectors that were solved together: "
-            "solve them one by one"
-        )
     n = basis.n_modes(solution.degree)
     if any(np.any(np.abs(each.static[:, n:]) > _SAME) for each in camera.detectors.values()):
         raise InputError(

@@ -35,7 +35,7 @@ from ...runtime.trees.facts import SIZE, array, number
 from ..known_maps import DETERMINED, KEPT, MEAN_SQUARE, chance
 from .camera_changes import modes_of
 from .combined_nights import Chain, contradiction, fitted, own_scatter2
-from .night_data import EXACT, Night, check_nights, check_numbers, dates_of, given_by, night_of, standard_numbers
+from .night_data import EXACT, Night, check_nights, check_numbers, dates_of, given_by, nights_of, standard_numbers
 
 if TYPE_CHECKING:
     from astropy.time import Time
@@ -117,10 +117,6 @@ class CombinedNights(ShownAsPrinted):
     def has_focal_plane(self) -> bool:
         """Whether the camera has several detectors, in a focal plane."""
         return self.nights[0].camera is not None
-
-    def _check_single(self, cure):
-        if self.has_focal_plane:
-            raise InputError(f"camera {self.name} has several detectors, and no single distortion: {cure}")
 
     def _year(self, date):
         return float(self.dates.max() if date is None else epochs.year(date))
@@ -240,7 +236,11 @@ class CombinedNights(ShownAsPrinted):
         InputError
             Of a camera with several detectors.
         """
-        self._check_single("take its camera, camera() (--camera)")
+        if self.has_focal_plane:
+            raise InputError(
+                f"camera {self.name} has several detectors, and no single distortion: take its camera, camera() "
+                "(--camera)"
+            )
         static, covariance = self.static(date, value, further_night=True)
         record = {"kind": "nights", "name": self.name, "nights": len(self.nights)}
         known = Prior(static, static_covariance=covariance, shape=self.shape, source=record)
@@ -387,8 +387,7 @@ class CombinedNights(ShownAsPrinted):
         return named | sizes | {"modes": records(self.modes(date, value)), "nights": records(self.table)}
 
     def plot(self, *, fig: Figure | None = None) -> Figure:
-        """Coefficients of one detector against time, see `legdistort.plots.memory_plots.plot_memory`."""
-        self._check_single("its coefficients are not drawn (leave --plot out), a picture of it is camera().plot()")
+        """Coefficients against time, see `legdistort.plots.memory_plots.plot_memory`."""
         return plot_memory(self, fig=fig)
 
     @plain_numbers
@@ -506,10 +505,13 @@ def combine_nights(
 ) -> CombinedNights:
     """Combine nights to one camera, its static distortion and layout, with what each night adds found from all.
 
-    Of every night counts what its exposures tell of the static distortion by dithers and rolls, whatever prior it was
-    solved with, so that a prior counts nowhere. What a night does not determine it does not state. A map of another
-    program is a night that states all, to its `static_sigma` or else to 0.001 pixels: of several `Prior.from_file` of
-    headers it is their mean, and their scatter.
+    Of every night counts what its exposures tell of the static distortion by dithers and rolls, whatever prior it
+    was solved with, so that a prior counts nowhere. What a night does not determine it does not state. A map of
+    another program is a night that states all, to its `static_sigma` or else to 0.001 pixels: of several
+    `Prior.from_file` of headers it is their mean, and their scatter.
+
+    Of several detectors a solution of several nights, or in which something of the camera was held or known
+    beforehand, is solved again, every night by itself with layout and static distortion fitted.
 
     Parameters
     ----------
@@ -534,13 +536,14 @@ def combine_nights(
     ------
     InputError
         Naming the night: of another detector or degree, with exposures that were given before, or without the
-        covariate; of several detectors if layout and static distortion were not both fitted with nothing known
-        beforehand, or with a covariate. If that is one number everywhere.
+        covariate; of several detectors with a covariate, or if it cannot be solved by itself. If the covariate is one
+        number everywhere.
 
     Warns
     -----
     AssumptionWarning
-        For maps without a width that do not scatter at a degree; for a covariate that may be an angle that wraps.
+        For maps without a width that do not scatter at a degree; for a covariate that may be an angle that wraps;
+        for nights of one exposure in a solution of several, of several detectors, which are left out.
 
     See Also
     --------
@@ -567,9 +570,9 @@ def combine_nights(
     nights = [night for _, each in earlier for night in each.nights]
     shapes = {each.shape for _, each in earlier}
     covariate = _common_covariate(earlier, covariate)
-    reduce, shown = partial(night_of, covariate=covariate), {"description": "nights", "unit": "night"}
+    reduce, shown = partial(nights_of, covariate=covariate), {"description": "nights", "unit": "night"}
     made = list(map_items(reduce, solved, workers=workers, progress=progress, **shown))
-    nights += [night for night, _ in made]
+    nights += [night for those, _ in made for night in those]
     check_nights(nights, shapes | {shape for _, shape in made})
     name = name or (earlier[0][1].name if earlier else "camera")
     shape = next(iter(shapes | {shape for _, shape in made}))

@@ -18,10 +18,12 @@ from ...results.solution import Solution
 from ...runtime.trees.facts import array, number
 from ..known_maps import shown_by, sound
 from .camera_changes import shown_of_camera
+from .solved_alone import nights_alone
 
 #: Error of a coefficient [pix] of a map that states none: that of a header as `legdistort attach` writes it.
 EXACT = 1e-3
 _TURN, _HALF = 360, 180  # degrees
+_SHOWN = "around", "information", "pull", "scatter", "nightly", "dof"  # of what a night shows
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,26 +98,30 @@ class Night:
 
     @classmethod
     def of(cls, solution: Solution, name: str, covariate: str | None = None) -> Night:
-        """That of a solution, with slopes by a column of the table of matches, if one is named."""
-        if solution.camera.has_focal_plane and covariate is not None:
-            raise InputError(
-                f"{name} is of camera {solution.camera.name} with several detectors, whose distortions are not sought "
-                "as dependent on a number: leave the covariate out"
-            )
+        """That of a solution of one detector, with slopes by a column of the table of matches, if one is named."""
         numbers = None if covariate is None else numbers_in(solution, covariate, name)
-        given = _shown_by(solution, name, numbers)
-        table, nights = solution.residuals[sound(solution)], solution.nights
-        counts = {f"n_{each}s": len(np.unique(table[each])) for each in ("exposure", "star")}
-        counts["n_nights"] = 1 if given["nightly"] is None else int(np.count_nonzero(~nights["odd"]))
-        date = float(np.mean(column_contract.values(table, "epoch", u.yr))) if "epoch" in table.colnames else None
-        odd = tuple(str(each) for each in nights["name"][nights["odd"]])
-        measured, used = fingerprints(solution.residuals), set(table["exposure"])
-        marks = tuple(mark for each in solution.names if each in used for mark in measured[each])
+        shown = shown_by(solution, name, numbers=numbers)
+        given = {each: getattr(shown, each) for each in _SHOWN}
+        nights = solution.nights
+        given["n_nights"] = 1 if shown.nightly is None else int(np.count_nonzero(~nights["odd"]))
+        given["odd"] = tuple(str(each) for each in nights["name"][nights["odd"]])
         if numbers is not None:
             values = np.array(list(numbers.values()))
             given |= {"value": float(values.mean()), "spread": float(values.std())}
             given |= {"lowest": float(values.min()), "highest": float(values.max())}
-        return cls(name, date=date, odd=odd, exposures=marks, **counts, **given)
+        return cls(name, **_counted(solution, sound(solution)), **given)
+
+    @classmethod
+    def of_camera(cls, solution: Solution, label: str) -> list[Night]:
+        """Those of a solution of several detectors, each by itself."""
+        out, table = [], solution.residuals
+        for name, exposures, own in nights_alone(solution, label):
+            information = shown_of_camera(own, name)
+            given = {"around": None, "information": information, "pull": np.zeros(len(information)), "nightly": None}
+            given |= {"scatter": np.zeros(own.degree + 1), "dof": np.inf, "n_nights": 1, "camera": own.camera}
+            rows = np.asarray(table["used"]) & np.isin(np.asarray(table["exposure"]), exposures)
+            out.append(cls(name, **_counted(solution, rows), **given))
+        return out
 
     @classmethod
     def of_map(cls, prior: Prior, name: str) -> Night:
@@ -140,14 +146,14 @@ class Night:
         )  # fmt: skip
 
 
-def _shown_by(solution, name, numbers):
-    """What the exposures of a solution show, as a `Night` has it."""
-    if not solution.camera.has_focal_plane:
-        shown = shown_by(solution, name, numbers=numbers)
-        return {each: getattr(shown, each) for each in ("around", "information", "pull", "scatter", "nightly", "dof")}
-    information = shown_of_camera(solution, name)
-    given = {"around": None, "information": information, "pull": np.zeros(len(information)), "nightly": None}
-    return given | {"scatter": np.zeros(solution.degree + 1), "dof": np.inf, "camera": solution.camera}
+def _counted(solution, rows):
+    """When some rows of the residuals were measured, how much they are, and what tells their exposures apart."""
+    table = solution.residuals[rows]
+    counts = {f"n_{each}s": len(np.unique(table[each])) for each in ("exposure", "star")}
+    date = float(np.mean(column_contract.values(table, "epoch", u.yr))) if "epoch" in table.colnames else None
+    measured, used = fingerprints(solution.residuals), set(table["exposure"])
+    marks = tuple(mark for each in solution.names if each in used for mark in measured[each])
+    return {"date": date, **counts, "exposures": marks}
 
 
 def numbers_in(solution, covariate, name):
@@ -175,15 +181,23 @@ def numbers_in(solution, covariate, name):
     return {str(each): float(value) for each, value in zip(names, values[first], strict=True)}
 
 
-def night_of(item, covariate=None):
-    """The night of a labelled solution, map or path, and the shape of its detector, or of its focal plane."""
+def nights_of(item, covariate=None):
+    """The nights of a labelled solution, map or path, and the shape of its detector, or of its focal plane."""
     label, thing = item
     if isinstance(thing, Prior):
         if covariate is not None:
             raise InputError(f"{label} is a map, which states no {covariate}: leave it out, or the covariate")
-        return Night.of_map(thing, label), thing.shape
+        return [Night.of_map(thing, label)], thing.shape
     solution = thing if isinstance(thing, Solution) else Solution.read(thing)
-    return Night.of(solution, label, covariate), next(iter(solution.estimate.shapes.values()))
+    shape = next(iter(solution.estimate.shapes.values()))
+    if not solution.camera.has_focal_plane:
+        return [Night.of(solution, label, covariate)], shape
+    if covariate is not None:
+        raise InputError(
+            f"{label} is of camera {solution.camera.name} with several detectors, whose distortions are not sought as "
+            "dependent on a number: leave the covariate out"
+        )
+    return Night.of_camera(solution, label), shape
 
 
 def check_nights(nights, shapes):
