@@ -19,11 +19,13 @@ from ..matching.matches import alone
 from ..results import accuracy
 from ..results.errors.absolute_errors import relative_blocks
 from ..results.solution import Solution
+from ..runtime.checks import check_positive
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..solving import star_motions
 from ..solving.equations.problem import build_problem
 from ..solving.options import SolveOptions
+from . import magnitudes
 from .aliasing import alias, assumed_spectra
 from .noiseless_solution import noiseless_solution
 from .plan import Plan, lay_out
@@ -31,6 +33,7 @@ from .prediction_text import decimals, describe, finite_rms
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
+    from astropy.table import QTable
     from matplotlib.axes import Axes
     from numpy.typing import ArrayLike
 
@@ -38,6 +41,7 @@ if TYPE_CHECKING:
     from ..priors.prior import Prior
     from ..runtime.annotations import Shape
     from ..solving.terms.term import RandomField, Term
+    from .instruments.instrument import Instrument
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +193,41 @@ class Prediction(ShownAsPrinted):
         )
         return ax
 
+    def by_magnitude(self, step: float = 1.0) -> QTable:
+        """Median errors in bins of magnitudes, where the stars have magnitudes.
+
+        Parameters
+        ----------
+        step : float
+            Width of a bin.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            ``mag`` (middle), ``n`` stars, ``error`` of a position in one exposure and ``joint_error`` of a star in the
+            solution, relative, per axis: mas, or pixels where the scale is not known.
+
+        Raises
+        ------
+        InputError
+            If the stars have no magnitudes.
+        """
+        check_positive(step, "step", "number of magnitudes")
+        return magnitudes.by_magnitude(self, step)
+
+    def plot_errors(self, *, ax: Axes | None = None) -> Axes:
+        """Error of a position against magnitude, in one exposure and joint (`by_magnitude`); returns the axes."""
+        from ..plots import planning_plots
+
+        instrument = self.settings.instrument
+        return planning_plots.plot_errors(
+            magnitudes.star_errors(self), self.by_magnitude(0.5),
+            limits=None if instrument is None else instrument.limits,
+            title=f"{'' if instrument is None else instrument.name + ': '}{self.n_exposures} exposures, "
+            f"{self.n_stars} stars, degree {self.degree}",
+            ax=ax,
+        )  # fmt: skip
+
     def alternatives(self) -> Table:
         """The same stars with half and twice the exposures, and fitted one degree lower and higher, as a table.
 
@@ -260,6 +299,7 @@ def predict(
     terms: Term | RandomField | Iterable[Term | RandomField] = (),
     tan_z: ArrayLike | None = None,
     parallactic_angle: ArrayLike | None = None,
+    instrument: Instrument | None = None,
     n_grid: int = 50,
     seed: int = 0,
 ) -> Prediction:
@@ -318,6 +358,11 @@ def predict(
         is as large as such fields make it. Columns that a term needs (`Term.needs`) are those of `stars`.
     tan_z, parallactic_angle : array_like, shape (n_exposures,), optional
         Tangent of the zenith distance, and degrees, of the exposures, which "refraction" needs.
+    instrument : Instrument, optional
+        In the place of `sigma`, `camera`, `shape` and `pixel_scale`: errors come from magnitudes, and stars that are
+        too bright or too faint are not measured. `stars` then is a table with ``x``, ``y``, ``mag``, or a luminosity
+        function to draw them from, evenly over the field: ``mag`` and ``density``, stars a magnitude and square arcmin
+        (or arcsec, by its unit), linear in between.
     n_grid : int
         Points of the maps along the longer side.
     seed : int
@@ -336,6 +381,7 @@ def predict(
 
     See Also
     --------
+    legdistort.Instrument : Errors from magnitudes.
     legdistort.simulate_matches : Draw such observations.
     legdistort.solve : Solve them.
 
@@ -356,7 +402,7 @@ def predict(
         shape=shape, dithers=dithers, poses=poses, prior=prior, dynamic=dynamic, spectrum=spectrum,
         static_spectrum=static_spectrum, min_exposures=min_exposures, n_grid=n_grid, seed=seed,
         epochs=epochs, field=field, camera=camera, pixel_scale=pixel_scale, terms=terms, tan_z=tan_z,
-        parallactic_angle=parallactic_angle,
+        parallactic_angle=parallactic_angle, instrument=instrument,
     )  # fmt: skip
     return _predict(plan)
 
@@ -393,7 +439,7 @@ def _predict(plan):
         folded, b_alias = aliasing.folded, float(np.sqrt(np.mean(aliasing.stars)))
     square = accuracy.contour(solution.estimate.positions)
     inside = accuracy.in_contour(grid, square)
-    drawn = {"stars": layout.positions, "n_stars": None, "density": None} if plan.stars is None else {}
+    drawn = {"stars": layout.stars, "n_stars": None, "density": None} if plan.stars is None or plan.has_counts else {}
     return Prediction(
         solution=solution,
         sigma_meas=layout.sigma,

@@ -60,10 +60,24 @@ def describe(prediction):
             row("sigma, new positions over the whole field", prediction.sigma_field, finite_rms(prediction.alias_map)),
             *(row(_MOTIONS[name].format(unit), error) for name, error in prediction.motion_errors.items()),
             *(f"found beside, of the size that is stated: {term!r}" for term in prediction.settings.terms),
+            *_by_magnitude(prediction),
             *textwrap.wrap(f"All but b, absolute, are relative: {_relative(prediction)}", 110),
             f"gauge {solution.gauge.kind}; thumb: s_b = 1/sqrt(n_im), s_sigma = sqrt((1 - 1/n_im)(1 + n_modes/n_star))",
         ]
     )
+
+
+def _by_magnitude(prediction):
+    """What an instrument measures, and the errors by magnitude."""
+    instrument = prediction.settings.instrument
+    if instrument is None:
+        return
+    bright, faint = instrument.limits
+    from_bright = f"from {bright:.2f} " if np.isfinite(bright) else ""
+    yield f"{repr(instrument)[1:-1]}: stars {from_bright}to {faint:.2f} mag"
+    yield f"{'mag':>8s}{'stars':>8s}{'one exposure [mas]':>22s}{'joint [mas]':>15s}"
+    for mag, n, error, joint in prediction.by_magnitude().iterrows():
+        yield f"{mag:8.1f}{n:8d}{error.value:22.4g}{joint.value:15.4g}"
 
 
 def _absolute(prediction):
