@@ -37,7 +37,9 @@ def main():
     IMAGES.mkdir(exist_ok=True)
     save(sweeps(), "sweeps.png")
     save(planned(), "planning.png", colours=256)
-    save(planned_with_micado(), "planning_errors.png", colours=256)
+    plan = planned_with_micado()
+    save(plan.plot_errors().figure, "planning_errors.png", colours=256)
+    save(plan.plot().figure, "planning_correction.png", colours=256)
     save(ld.Camera.gsaoi().plot().figure, "gsaoi_camera.png")
     with tempfile.TemporaryDirectory() as folder:
         night = run_demo(out=Path(folder) / "night")
@@ -127,8 +129,7 @@ def planned_with_micado():
     micado = ld.Instrument.named("MICADO", filter="Ks", psf=psf, exposure_time=60, error_floor=0.01)
     mag = np.arange(15.0, 25.0)
     stars = Table({"mag": mag, "density": 30 * 10 ** (0.25 * (mag - 18))})
-    plan = ld.predict(n_exposures=20, instrument=micado, stars=stars, dithers=500, degree=3, dynamic=0.5)
-    return plan.plot_errors().figure
+    return ld.predict(n_exposures=20, instrument=micado, stars=stars, dithers=500, degree=3, dynamic=0.5)
 
 
 def planned():

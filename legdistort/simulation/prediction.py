@@ -29,7 +29,7 @@ from . import magnitudes
 from .aliasing import alias, assumed_spectra
 from .noiseless_solution import noiseless_solution
 from .plan import Plan, lay_out
-from .prediction_text import decimals, describe, finite_rms
+from .prediction_text import decimals, describe, finite_rms, unit_of
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -75,6 +75,8 @@ class Prediction(ShownAsPrinted):
     error_map, alias_map : ndarray, shape (n_y, n_x)
         Scatter sigma_j' over the field (the paper's Figure "ergrid"), NaN where fewer than two exposures see it; and
         that from aliasing.
+    correction_map : ndarray, shape (n_y, n_x)
+        The part of the scatter that the correction has, whatever the error of a new position, aliasing aside.
     contour : ndarray, shape (2, 2)
         Lower and upper corner of the square.
     folded : ndarray, shape (2, n_modes)
@@ -97,6 +99,7 @@ class Prediction(ShownAsPrinted):
     y: np.ndarray
     error_map: np.ndarray
     alias_map: np.ndarray
+    correction_map: np.ndarray
     contour: np.ndarray
     folded: np.ndarray
     spectrum: np.ndarray
@@ -132,6 +135,12 @@ class Prediction(ShownAsPrinted):
     def s_sigma(self) -> float:
         """Slope of the noise propagation on corrected positions, sigma / sigma_meas (paper, section 4.2)."""
         return self.sigma / self.sigma_meas
+
+    @property
+    def sigma_correction(self) -> float:
+        """The part of `sigma` that the correction has, whatever the error of a new position."""
+        grid = np.stack(np.meshgrid(self.x, self.y), axis=-1).reshape(-1, 2)
+        return finite_rms(self.correction_map.ravel()[accuracy.in_contour(grid, self.contour)])
 
     @property
     def b_total(self) -> float:
@@ -179,18 +188,24 @@ class Prediction(ShownAsPrinted):
     def plot(self, *, ax: Axes | None = None) -> Axes:
         """Map of the expected scatter of new positions, aliasing included, with stars and contour; returns the axes.
 
-        The paper's Figure "ergrid". Of more than 300 stars none are drawn.
+        The paper's Figure "ergrid". With an instrument new positions have no error that is common to all, and the
+        part is shown that the correction has. Of more than 300 stars none are drawn.
         """
         from ..plots import elements, solution_plots
 
-        stars = self.solution.estimate.positions
-        total = np.hypot(self.error_map, self.alias_map)
-        ax = solution_plots.plot_sigma_map(self.x, self.y, total, stars=stars if len(stars) <= 300 else None, ax=ax)
+        stars, (unit, scale) = self.solution.estimate.positions, unit_of(self)
+        shown, what = (
+            (self.correction_map, "Error of the correction")
+            if self.settings.instrument
+            else (self.error_map, "Expected scatter")
+        )
+        total = scale * np.hypot(shown, self.alias_map)
+        ax = solution_plots.plot_sigma_map(
+            self.x, self.y, total, stars=stars if len(stars) <= 300 else None, unit=unit, ax=ax
+        )
         (x0, y0), (x1, y1) = self.contour
         ax.plot([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], color=elements.RED, linewidth=1.8)
-        elements.set_title(
-            ax, f"Expected scatter: {self.n_exposures} exposures, {self.n_stars} stars, degree {self.degree}"
-        )
+        elements.set_title(ax, f"{what}: {self.n_exposures} exposures, {self.n_stars} stars, degree {self.degree}")
         return ax
 
     def by_magnitude(self, step: float = 1.0) -> QTable:
@@ -349,8 +364,8 @@ def predict(
     field : `~astropy.coordinates.SkyCoord`, optional
         Where it lies: parallaxes are fitted too.
     pixel_scale : float, optional
-        Arcsec: lengths may be given as angles then (``0.4 * u.mas``), and the printed errors are angles. Attributes and
-        maps stay in pixels.
+        Arcsec: lengths may be given as angles then (``0.4 * u.mas``), and errors are angles where they are printed or
+        drawn. Attributes stay in pixels.
     terms : Term, or a list of them, optional
         What displaces stars beside the distortion and will be found with it, as `legdistort.solve` takes them, but with
         their sizes: ``Term.named("pixel_phase", sigma=0.03)``, ``Term.named("turbulence", size=0.1, length=200)``.
@@ -453,6 +468,7 @@ def _predict(plan):
         y=y,
         error_map=noise.reshape(len(y), len(x)),
         alias_map=aliased.reshape(len(y), len(x)),
+        correction_map=accuracy.expected_scatter(solution, grid, 0.0, covariance=errors).reshape(len(y), len(x)),
         contour=square,
         folded=folded,
         spectrum=independent,

@@ -12,7 +12,7 @@ def decimals(prediction, scale=1.0):
     return max(4 if scale == 1 else 0, 3 - int(np.floor(np.log10(scale * prediction.sigma_meas))))
 
 
-def _unit(prediction):
+def unit_of(prediction):
     """The unit in which errors are shown, and its number in a pixel."""
     scale = prediction.settings.pixel_scale
     return ("px", 1.0) if scale is None else ("mas", 1e3 * scale)
@@ -26,12 +26,12 @@ def finite_rms(values):
 
 def describe(prediction):
     """A `Prediction` as ``print`` shows it: both criteria, aliasing where any is assumed, slopes and rules of thumb."""
-    solution = prediction.solution
+    solution, instrument = prediction.solution, prediction.settings.instrument
     ny, nx = solution.estimate.shapes[solution.names[0]]
     low, high = prediction.stars_per_exposure.min(), prediction.stars_per_exposure.max()
     thumb_b, thumb_sigma = prediction.thumb
     aliased = np.any(prediction.folded != 0)  # NaN included
-    unit, scale = _unit(prediction)
+    unit, scale = unit_of(prediction)
     places = decimals(prediction, scale)
 
     def row(label, noise, aliasing=None, *slopes):
@@ -57,6 +57,7 @@ def describe(prediction):
             row("b, star positions, relative", *b, prediction.s_b, thumb_b),
             row(_absolute(prediction), prediction.b_abs),
             row("sigma, new positions inside the contour", *sigma, prediction.s_sigma, thumb_sigma),
+            *([row("of this the error of the correction", prediction.sigma_correction)] * bool(instrument)),
             row("sigma, new positions over the whole field", prediction.sigma_field, finite_rms(prediction.alias_map)),
             *(row(_MOTIONS[name].format(unit), error) for name, error in prediction.motion_errors.items()),
             *(f"found beside, of the size that is stated: {term!r}" for term in prediction.settings.terms),

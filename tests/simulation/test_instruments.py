@@ -296,6 +296,10 @@ def test_pictures_of_errors(undrawn):
     assert ax.get_title(loc="left").startswith("instrument: 4 exposures,")
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["one exposure", "joint"]
     assert_allclose([line.get_xdata()[0] for line in ax.lines[-2:]], made.limits)
+    ax = plan.plot()
+    assert ax.get_title(loc="left").startswith("Error of the correction: 4 exposures,")
+    assert_allclose(ax.collections[0].get_array().compressed(), 20 * plan.correction_map.ravel(), rtol=1e-12)
+    assert [each.get_ylabel() for each in ax.figure.axes] == ["y [px]", "error per axis [mas]"]
     known = Table({"x": [10.0, 1900.0, 900.0, 600.0], "y": [20.0, 800.0, 1700.0, 30.0], "mag": [1.0, 2.0, 3.0, 4.0]})
     pixels = ld.predict(n_exposures=3, stars=known, sigma=0.02, degree=0).by_magnitude()
     assert_allclose(pixels["error"].to_value(u.pix), 0.02)
