@@ -18,6 +18,7 @@ from legdistort.simulation.instruments.presets import preset_names
 from legdistort.simulation.instruments.star_counts import draw_magnitudes
 from legdistort.simulation.pupil import PupilPSF
 
+SKY_ELECTRONS = 30.0 * (10 ** (-0.4 * (14.0 - 26.0)) * 0.02**2 + 0.05)
 CAMERA = ld.Camera("one", {"1": ld.Detector((512, 512))})
 
 
@@ -60,7 +61,7 @@ def gaussian_psf(width, steps=5, half=20):
     return ld.EffectivePSF.from_array(gaussian(d, d[:, None], width), oversampling=steps)
 
 
-@pytest.mark.parametrize("width", [0.8, 1.5])
+@pytest.mark.parametrize("width", [0.4, 1.5])
 @pytest.mark.parametrize("n_coadds", [1, 4])
 def test_errors_are_those_of_a_fisher_matrix(width, n_coadds):
     made = instrument(gaussian_psf(width), n_coadds=n_coadds)
@@ -68,7 +69,7 @@ def test_errors_are_those_of_a_fisher_matrix(width, n_coadds):
     sky = time * (10 ** (-0.4 * (14.0 - 26.0)) * 0.02**2 + 0.05)
     for mag in (10.0, 16.0, 19.0, 22.0):
         flux = time * 10 ** (-0.4 * (mag - 26.0))
-        errors, snr = bound(lambda x, y: gaussian(x, y, width), flux, sky, 10 * n_coadds**0.5, int(12 * width))
+        errors, snr = bound(lambda x, y: gaussian(x, y, width), flux, sky, 10 * n_coadds**0.5, int(np.ceil(12 * width)))
         assert_allclose(made.position_error([mag]), np.mean(errors), rtol=0.01)
         assert_allclose(made.snr([mag]), snr, rtol=0.01)
 
@@ -89,11 +90,10 @@ def test_stars_too_bright_and_too_faint():
     width = 1.5
     made = instrument(gaussian_psf(width), full_well=5e4, min_snr=7.0)
     bright, faint = made.limits
-    sky = 30.0 * (10 ** (-0.4 * (14.0 - 26.0)) * 0.02**2 + 0.05)
-    peak = 30.0 * 10 ** (-0.4 * (bright - 26.0)) * gaussian(0.0, 0.0, width) + sky
+    peak = 30.0 * 10 ** (-0.4 * (bright - 26.0)) * gaussian(0.0, 0.0, width) + SKY_ELECTRONS
     assert peak == pytest.approx(5e4, rel=1e-3)
     flux = 30.0 * 10 ** (-0.4 * (faint - 26.0))
-    assert bound(lambda x, y: gaussian(x, y, width), flux, sky, 10.0, 18)[1] == pytest.approx(7.0, rel=0.01)
+    assert bound(lambda x, y: gaussian(x, y, width), flux, SKY_ELECTRONS, 10.0, 18)[1] == pytest.approx(7.0, rel=0.01)
     stars = [bright - 0.01, bright + 0.01, faint - 0.01, faint + 0.01]
     assert made.measures(stars).tolist() == [False, True, True, False]
     # integrations that are added up are filled one by one
@@ -156,6 +156,17 @@ def as_tiptop(path, images, places, mas):
     return path
 
 
+def test_tiptop_averages_what_is_undersampled(tmp_path):
+    """Into samples of 20 mas here, as large as pixels, of 1.6 in wavelength / diameter."""
+    fine = airy(2, 1.6, 128)
+    image = fine.reshape(128, 2, 128, 2).sum(axis=(1, 3))
+    path = as_tiptop(tmp_path / "psf.fits", image[None], [(0, 0)], 20.0)
+    with fits.open(path, mode="update") as hdus:
+        hdus[0].header["HIERARCH telescope TelescopeDiameter"] = np.degrees(2.145e-6 / 0.032) * 3600
+    errors, _ = truth_of_airy(1.6, 30.0 * 10 ** (-0.4 * (20.0 - 26.0)), SKY_ELECTRONS, 10.0, 8)
+    assert_allclose(instrument(path).position_error([20.0]), np.mean(errors), rtol=0.03)
+
+
 def as_mavisim(path, images, places):
     hdus = [fits.ImageHDU(image) for image in images]
     for hdu, (x, y) in zip(hdus, places, strict=True):
@@ -195,12 +206,21 @@ def test_files_of_simulators(star, kind, tmp_path):
         fits.writeto(path, star)
         more = {"psf_scale": 0.005}
     made = instrument(path, **more)
-    sky = 30.0 * (10 ** (-0.4 * (14.0 - 26.0)) * 0.02**2 + 0.05)
     half = int(np.ceil(4 * made.fwhm))
     for mag in (14.0, 21.0):
-        errors, snr = truth_of_airy(RESOLUTION, 30.0 * 10 ** (-0.4 * (mag - 26.0)), sky, 10.0, half)
+        errors, snr = truth_of_airy(RESOLUTION, 30.0 * 10 ** (-0.4 * (mag - 26.0)), SKY_ELECTRONS, 10.0, half)
         assert_allclose(made.position_error([mag]), np.mean(errors), rtol=0.02)
         assert_allclose(made.snr([mag]), snr, rtol=0.02)
+
+
+def test_a_star_that_is_not_round(tmp_path):
+    """Flux and sky are free in the truth; the error is that of the mean information on x and y."""
+    fits.writeto(tmp_path / "psf.fits", airy(STEPS, RESOLUTION, 64, coma=0.7))
+    made = instrument(tmp_path / "psf.fits", psf_scale=0.005)
+    flux, half = 30.0 * 10 ** (-0.4 * (21.0 - 26.0)), int(np.ceil(4 * made.fwhm))
+    errors, _ = truth_of_airy(RESOLUTION, flux, SKY_ELECTRONS, 10.0, half, coma=0.7)
+    assert errors[1] > 1.1 * errors[0]
+    assert_allclose(made.position_error([21.0]), np.mean(errors**-2.0) ** -0.5, rtol=0.01)
 
 
 def test_measuring_takes_what_calc_psf_writes_as_light_on_samples(star, tmp_path):
@@ -286,6 +306,18 @@ def test_a_plan_from_a_luminosity_function():
     assert np.all(rows["joint_error"] < rows["error"])
     assert np.all(np.diff(rows["error"].value) > 0)
     assert len(plan.alternatives()) == 5
+
+
+def test_stars_that_are_listed_are_measured_or_not():
+    made = instrument(gaussian_psf(1.5), full_well=5e4)
+    bright, faint = made.limits
+    place = np.random.default_rng(2).uniform(20, 490, (2, 30))
+    table = Table([*place, np.linspace(bright + 0.1, faint - 0.1, 30)], names=("x", "y", "mag"))
+    all_of_them = ld.predict(n_exposures=4, instrument=made, stars=table, degree=1)
+    table["mag"][[3, 7]] = bright - 0.1, faint + 0.1
+    some = ld.predict(n_exposures=4, instrument=made, stars=table, degree=1)
+    assert (all_of_them.n_stars, some.n_stars) == (30, 28)
+    assert not {3, 7} & set(np.asarray(some.solution.residuals["star"]).astype(int))
 
 
 def test_pictures_of_errors(undrawn):
@@ -476,10 +508,9 @@ def test_command(star, tmp_path, capsys, monkeypatch):
 def test_a_pupil_in_the_place_of_a_file():
     pupil = PupilPSF(strehl=None, resolution=RESOLUTION, obstruction=0.0)
     made = instrument(pupil)
-    sky = 30.0 * (10 ** (-0.4 * (14.0 - 26.0)) * 0.02**2 + 0.05)
     half = int(np.ceil(4 * made.fwhm))
     for mag in (14.0, 21.0):
-        errors, _ = truth_of_airy(RESOLUTION, 30.0 * 10 ** (-0.4 * (mag - 26.0)), sky, 10.0, half)
+        errors, _ = truth_of_airy(RESOLUTION, 30.0 * 10 ** (-0.4 * (mag - 26.0)), SKY_ELECTRONS, 10.0, half)
         assert_allclose(made.position_error([mag]), np.mean(errors), rtol=0.02)
     gridded = instrument(pupil.over((100, 100)))
     assert_allclose(gridded.position_error([14.0, 21.0]), made.position_error([14.0, 21.0]), rtol=1e-3)

@@ -160,7 +160,7 @@ def on_samples(hdus):
     return next((hdus[name] for name in ("OVERDIST", "OVERSAMP") if name in [hdu.name for hdu in hdus]), None)
 
 
-def over_pixels(images, width):
+def over_pixels(images, width, *, averaged=1):
     """Light that falls into a pixel around every sample.
 
     Parameters
@@ -170,6 +170,8 @@ def over_pixels(images, width):
         wavelength / diameter.
     width : float
         Of a pixel, in samples.
+    averaged : int
+        Every sample is the mean of so many by so many finer ones already.
 
     Returns
     -------
@@ -177,7 +179,10 @@ def over_pixels(images, width):
         As `EffectivePSF.from_array` takes it, for ``oversampling=width``: `width` squared times the sums of `images`.
     """
     ny, nx = images.shape[-2:]
-    y, x = (np.sinc(frequency(n) * width) for frequency, n in ((fft.fftfreq, ny), (fft.rfftfreq, nx)))
+    y, x = (
+        np.sinc(frequency * width) * np.sinc(frequency / averaged) / np.sinc(frequency)
+        for frequency in (fft.fftfreq(ny), fft.rfftfreq(nx))
+    )
     return width**2 * fft.irfft2(fft.rfft2(images) * y[:, None] * x, s=(ny, nx))
 
 

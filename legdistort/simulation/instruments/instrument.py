@@ -43,9 +43,9 @@ class _Curve:
 class Instrument(ShownAsPrinted):
     """An instrument, its point-spread function and an exposure: what `legdistort.predict` has the errors from.
 
-    The error of a position is the Cramer-Rao bound: photon noise of star and sky, and read noise, the PSF and the
-    level of the sky known, mean of x and y, the star anywhere on its pixel. Neighbours, flat fields and errors of the
-    PSF come on top, as `error_floor`.
+    The error of a position is the Cramer-Rao bound, of the mean information on x and y: photon noise of star and sky,
+    and read noise. The PSF is known, and the star anywhere on its pixel. Neighbours, flat fields and errors of the PSF
+    come on top, as `error_floor`.
 
     Parameters
     ----------

@@ -68,7 +68,7 @@ def field_psf(given, *, pixel_scale, sample_scale=None):
         if not isinstance(psf, EffectivePSF):
             raise InputError(f"psf must be one PSF, a file of one, or a photutils model, got {given!r}")
         return FieldPSF([_on_pixels(psf)], np.zeros((1, 2)))
-    images, places, scale = _bare(Path(given)) if stated is None else stated
+    images, places, scale, averaged = _bare(Path(given)) if stated is None else stated
     if scale is None and sample_scale is None:
         raise InputError(f"{given}: the file does not state the size of its samples: give psf_scale (arcsec)")
     width = pixel_scale / (sample_scale if scale is None else scale)
@@ -80,7 +80,7 @@ def field_psf(given, *, pixel_scale, sample_scale=None):
     total = images.sum(axis=(1, 2), keepdims=True)
     if not (np.isfinite(images).all() and np.all(total > 0)):
         raise InputError(f"{given}: the PSF holds no light, or values that are not finite")
-    light = over_pixels(np.where((total > 0.5) & (total < 1.001), images, images / total), width)
+    light = over_pixels(np.where((total > 0.5) & (total < 1.001), images, images / total), width, averaged=averaged)
     made = [EffectivePSF.from_array(each, oversampling=float(width), source=Path(given).name) for each in light]
     return FieldPSF([_on_pixels(psf) for psf in made], places)
 
@@ -99,25 +99,29 @@ def _on_pixels(psf):
 
 
 def _of_simulator(path):
-    """Images (n, ny, nx), places (n, 2) and the size of a sample [arcsec] or None; None for files of another kind."""
+    """Images (n, ny, nx), places (n, 2), size of a sample [arcsec] or None, and how many finer ones are averaged in it.
+
+    None for files of another kind.
+    """
     try:
         with path.open("rb") as file, open_fits(file, path) as hdus:
             tiptop = next((hdu for hdu in hdus if "PIX_MAS" in hdu.header), None)
             if tiptop is not None:
-                return _of_tiptop(tiptop, path)
+                return _of_tiptop(tiptop, hdus[0].header, path)
             of_places = [hdu for hdu in hdus if {"XPOS", "YPOS"} <= set(hdu.header)]
             if of_places:
                 places = np.array([[float(hdu.header[key]) for key in ("XPOS", "YPOS")] for hdu in of_places])
-                return np.array([hdu.data for hdu in of_places], dtype=float), places, None
+                return np.array([hdu.data for hdu in of_places], dtype=float), places, None, 1
             fine = on_samples(hdus)
             if fine is not None and "PIXELSCL" in fine.header:
-                return np.array([fine.data], dtype=float), np.zeros((1, 2)), float(fine.header["PIXELSCL"])
+                return np.array([fine.data], dtype=float), np.zeros((1, 2)), float(fine.header["PIXELSCL"]), 1
     except OSError as error:
         raise InputError(f"{path}: no FITS file that could be read ({error})") from None
     return None
 
 
-def _of_tiptop(hdu, path):
+def _of_tiptop(hdu, parameters, path):
+    """Of an image that would be undersampled it writes means of blocks of a finer one, of `averaged` samples a side."""
     images = np.asarray(hdu.data, dtype=float)
     if images.ndim == 4 and len(images) == 1:
         images = images[0]
@@ -128,7 +132,11 @@ def _of_tiptop(hdu, path):
     keys = [(f"CCX{k:04d}", f"CCY{k:04d}") for k in range(len(images))]
     if not all(key in hdu.header for pair in keys for key in pair):
         raise InputError(f"{path}: there are {len(images)} PSFs, but not as many places CCX0000, CCY0000, ...")
-    return images, np.array([[float(hdu.header[key]) for key in pair] for pair in keys]), scale
+    averaged, diameter = 1, parameters.get("telescope TelescopeDiameter")
+    if diameter is not None and "WL_NM" in hdu.header:
+        in_samples = np.degrees(1e-9 * float(hdu.header["WL_NM"]) / float(diameter)) * 3600 / scale
+        averaged = int(np.ceil(2 / in_samples))  # as P3 and MASTSEL, which it calls, have it
+    return images, np.array([[float(hdu.header[key]) for key in pair] for pair in keys]), scale, averaged
 
 
 def _bare(path):
@@ -137,4 +145,4 @@ def _bare(path):
         image = next((hdu.data for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) == 2), None)
     if image is None:
         raise InputError(f"{path}: there is no image in it")
-    return np.array([image], dtype=float), np.zeros((1, 2)), None
+    return np.array([image], dtype=float), np.zeros((1, 2)), None, 1
