@@ -309,6 +309,7 @@ def do_predict(a):
     plans = prediction.alternatives()
     own, *others = records(plans)
     own |= {"unknown": list(prediction.solution.gauge.unknown_names), "alternatives": others}
+    own |= {"by_magnitude": records(prediction.by_magnitude())} if a.instrument else {}
     _say(a, f"{prediction}\n\n{describe_plans(plans)}", own | {"failed": plans.meta["failed"]})
 
 

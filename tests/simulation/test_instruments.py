@@ -496,6 +496,7 @@ def test_command(star, tmp_path, capsys, monkeypatch):
     assert main([*words, "--json"]) == 0
     figures = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert figures["b"] == pytest.approx(plan.b)
+    assert [row["n"] for row in figures["by_magnitude"]] == plan.by_magnitude()["n"].tolist()
     for more, message in (
         (asked, "--instrument needs --psf too"),
         ([*asked[:5], "--coadds", "2"], "--coadds is for --instrument: leave it out"),

@@ -8,6 +8,7 @@ from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from ...cameras.camera import Camera, check_camera
 from ...exceptions import InputError
@@ -24,17 +25,16 @@ if TYPE_CHECKING:
     from ...runtime.annotations import StrPath
 
 _PHASES = 4  # places of a star along a pixel that are averaged over
-_STEP = 0.1  # magnitudes between which the logarithm of an error is linear: to 2e-4
+_STEP = 0.25  # magnitudes between which the logarithm of an error is cubic: to 1e-6
 _BRIGHT, _FAINT = 30.0, 3.0  # magnitudes from a star of one electron over which curves are known
 
 
 @dataclass(frozen=True, eq=False)
 class _Curve:
-    """Errors and signal to noise against magnitude, of one PSF."""
+    """Logarithms of error and signal to noise against magnitude, of one PSF."""
 
-    mag: np.ndarray
-    log_error: np.ndarray
-    log_snr: np.ndarray
+    log_error: CubicSpline
+    log_snr: CubicSpline
     limits: tuple[float, float]
 
 
@@ -199,13 +199,13 @@ class Instrument(ShownAsPrinted):
         InputError
             For magnitudes that are not finite.
         """
-        found = self._by_place(mag, at, lambda curve, m: np.exp(np.interp(m, curve.mag, curve.log_error)))
+        found = self._by_place(mag, at, lambda curve, m: np.exp(curve.log_error(m)))
         return np.hypot(found, self.error_floor)
 
     @plain_numbers
     def snr(self, mag: ArrayLike, *, at: ArrayLike | None = None) -> np.ndarray:
         """Ratio of signal to noise of the flux, position and sky known, (n,); see `position_error`."""
-        return self._by_place(mag, at, lambda curve, m: np.exp(np.interp(m, curve.mag, curve.log_snr)))
+        return self._by_place(mag, at, lambda curve, m: np.exp(curve.log_snr(m)))
 
     @plain_numbers
     def measures(self, mag: ArrayLike, *, at: ArrayLike | None = None) -> np.ndarray:
@@ -259,8 +259,9 @@ class Instrument(ShownAsPrinted):
             variance = noise["sky"] + flux[:, None, None] * light + noise["read_noise"] ** 2
             of_flux = of_flux + np.sum(light**2 / variance, axis=(1, 2)) / _PHASES**2
         log_snr = np.log(flux) + np.log(of_flux) / 2
-        faint = float(np.interp(-np.log(self.min_snr), -log_snr, mag))
-        return _Curve(mag, -np.log(information) / 2, log_snr, (self._brightest(psf), faint))
+        faint = float(CubicSpline(-log_snr, mag)(-np.log(self.min_snr)))
+        limits = self._brightest(psf), faint
+        return _Curve(CubicSpline(mag, -np.log(information) / 2), CubicSpline(mag, log_snr), limits)
 
     def _brightest(self, psf):
         """Magnitude of a star in the middle of a pixel that fills it."""
