@@ -361,6 +361,11 @@ def test_presets():
     assert_allclose([gap["3"], gap["4"]], [2.5 / 0.015, 6.5 / 0.015], atol=0.1)
     # what the published estimator makes of 28 mag in J without extinction: 7.72 e-/s
     assert 10 ** (-0.4 * (28.0 - 0.1 - made["MICADO"].zero_point)) == pytest.approx(7.72, rel=2e-3)
+    # and of sky and dark current [electrons a pixel and second]
+    for name, expected in (("J", 5.019), ("H", 28.407), ("Ks", 78.703)):
+        one = ld.Instrument.named("MICADO", filter=name, psf=psf, exposure_time=1)
+        sky = 10 ** (-0.4 * (one.sky_brightness - one.zero_point)) * one.pixel_scale**2 + one.dark_current
+        assert sky == pytest.approx(expected, rel=3e-3)
     # 64" and a gap of 4"
     places = made["NIRCam-SW"].camera.places
     assert np.hypot(places["A1"].x - places["A2"].x, places["A1"].y - places["A2"].y) * 0.0311 == pytest.approx(

@@ -97,7 +97,7 @@ class Instrument(ShownAsPrinted):
     >>> psf = ld.EffectivePSF.from_array(np.exp(-(x**2 + y**2) / 2 / 1.2**2), oversampling=4)
     >>> micado = ld.Instrument.named("MICADO", filter="Ks", psf=psf, exposure_time=60)
     >>> (1e3 * micado.pixel_scale * micado.position_error([18, 22])).round(4)  # mas
-    array([0.0011, 0.0089])
+    array([0.0011, 0.009 ])
     """
 
     camera: Camera
