@@ -32,6 +32,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_PLACES` states the s
     from .pipeline import run as run
     from .priors.prior import Prior as Prior
     from .results.solution import Solution as Solution
+    from .simulation.instruments.instrument import Instrument as Instrument
     from .simulation.observations import simulate_exposures as simulate_exposures
     from .simulation.observations import simulate_matches as simulate_matches
     from .simulation.prediction import predict as predict
@@ -51,6 +52,7 @@ _PLACES = {
     "Detector": "cameras.detector",
     "EffectivePSF": "measurement.effective.model",
     "Exposure": "inputs.exposures",
+    "Instrument": "simulation.instruments.instrument",
     "LegdistortError": "exceptions",
     "LegdistortWarning": "exceptions",
     "Matches": "matching.matches",

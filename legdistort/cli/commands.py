@@ -25,6 +25,7 @@ from . import options
 from .arguments import flagged, given, lines_of_images, wants_progress
 from .given_files import (
     given_camera,
+    given_plan,
     given_prior,
     given_solving,
     grid_in,
@@ -32,9 +33,7 @@ from .given_files import (
     read_given,
     read_lists,
     read_matches,
-    read_prior,
     refuse,
-    sized_term,
     without_options_of_prior,
 )
 from .repeating import repeatable
@@ -303,22 +302,14 @@ def do_predict(a):
     """``legdistort predict``."""
     from ..simulation.prediction_text import describe_plans
 
-    keywords = given(a, options.PREDICTING) | {"prior": read_prior(a)}
-    keywords.pop("static_sigma", None)
-    if a.stars is not None:
-        keywords["stars"] = read_given(a.stars, a)
-    else:
-        refuse({"columns": a.columns or None, "origin": a.origin, "error": a.error}, "is for the table of --stars")
-    if a.camera:
-        refuse({"shape": a.shape}, "comes from --camera")
-    if a.shape is not None:
-        keywords["shape"] = tuple(a.shape)
-    keywords |= {"camera": given_camera(a.camera), "terms": [sized_term(*each) for each in a.term or ()]}
-    prediction = legdistort.predict(**keywords)
+    prediction = legdistort.predict(**given_plan(a))
     _draw(prediction, a)
+    if a.plot_errors is not None:
+        _write_picture(prediction.plot_errors().figure, a, a.plot_errors)
     plans = prediction.alternatives()
     own, *others = records(plans)
     own |= {"unknown": list(prediction.solution.gauge.unknown_names), "alternatives": others}
+    own |= {"by_magnitude": records(prediction.by_magnitude())} if a.instrument else {}
     _say(a, f"{prediction}\n\n{describe_plans(plans)}", own | {"failed": plans.meta["failed"]})
 
 
@@ -520,7 +511,9 @@ def _draw(result, a):
     _write_picture(_picture(result, a), a)
 
 
-def _write_picture(figure, a):
+def _write_picture(figure, a, path=None):
+    """Write a picture, if there is one, to the file of ``--plot`` or another."""
     if figure is not None:
-        with outputs.replacing(a.plot, overwrite=a.overwrite) as file:
-            figure.savefig(file, format=a.plot.suffix[1:].lower(), dpi=120)
+        path = a.plot if path is None else path
+        with outputs.replacing(path, overwrite=a.overwrite) as file:
+            figure.savefig(file, format=path.suffix[1:].lower(), dpi=120)

@@ -27,6 +27,7 @@ from ..solving.choices.degree_choice import AUTO, HIGHEST
 from ..solving.options import DEGREE
 from .arguments import given
 from .options import EXPANDING, SOLVING
+from .planning_options import EXPOSURES, INSTRUMENT, PREDICTING
 
 log = logging.getLogger(__name__)
 
@@ -91,6 +92,33 @@ def given_camera(given):
         return legdistort.Camera.gsaoi() if given else None
     solved = Path(given).is_dir() or entry_of(given, ["legdistort"]) is not None
     return legdistort.Solution.read(given).camera if solved else legdistort.Camera.read(given)
+
+
+def given_plan(a):
+    """The arguments of `legdistort.predict`."""
+    keywords = given(a, PREDICTING) | {"prior": read_prior(a), "instrument": _given_instrument(a)}
+    keywords.pop("static_sigma", None)
+    if a.stars is not None:
+        keywords["stars"] = read_given(a.stars, a)
+    else:
+        refuse({"columns": a.columns or None, "origin": a.origin, "error": a.error}, "is for the table of --stars")
+    if a.camera:
+        refuse({"shape": a.shape}, "comes from --camera")
+    if a.shape is not None:
+        keywords["shape"] = tuple(a.shape)
+    return keywords | {"camera": given_camera(a.camera), "terms": [sized_term(*each) for each in a.term or ()]}
+
+
+def _given_instrument(a):
+    """The instrument of ``--instrument`` and what goes with it; None without."""
+    words = given(a, INSTRUMENT, EXPOSURES)
+    if a.instrument is None:
+        refuse({name.removeprefix("n_"): value for name, value in words.items()}, "is for --instrument")
+        return None
+    for needed in ("psf", "exposure_time"):
+        if needed not in words:
+            raise InputError(f"--instrument needs --{needed.replace('_', '-')} too")
+    return legdistort.Instrument.named(**words)
 
 
 def read_matches(a):

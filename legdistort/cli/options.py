@@ -9,14 +9,11 @@ from .arguments import (
     columns,
     extension,
     keywords,
-    length,
     names,
     number_or_name,
     pairs,
     planes,
-    sized_terms,
     some_words,
-    spectrum,
     word_or,
 )
 
@@ -391,33 +388,4 @@ ATTACHING = {
     "asdf_only": Option("leave the header alone, add the exact WCS", action="store_true", one_of="header"),
     "max_error": Option("of the header, pixels (default 0.001)", type=float),
     "overwrite": Option("replace copies and ASDF extensions that exist", action="store_true"),
-}
-PREDICTING = {
-    "n_exposures": Option("how many", type=int, required=True),
-    "n_stars": Option("so many, drawn evenly over the field", type=int, one_of="stars", required=True),
-    "density": Option("the same, as stars a detector", type=float, one_of="stars", required=True),
-    "stars": Option(
-        "x, y in the reference plane, perhaps x_err, y_err", metavar="TABLE", path="read", one_of="stars", required=True
-    ),
-    "sigma": Option("error of one measured position, pixels (default: x_err, y_err)", type=length, metavar="LENGTH"),
-    "degree": Option("total degree to be fitted (default 3)", type=int),
-    "dithers": Option("rms length of the shifts, pixels (default 0)", "--dither", type=length, metavar="LENGTH"),
-    **KNOWN_STATIC,
-    "dynamic": Option("rms of a coefficient from exposure to exposure, pixels", type=length, metavar="LENGTH"),
-    "spectrum": Option("the same by degree, beyond the fit too", type=spectrum, metavar="DEGREE=RMS,..."),
-    "epochs": Option("years of the exposures: motions are fitted too", type=float, nargs="+", metavar="YEAR"),
-    "pixel_scale": Option(
-        "the errors in mas; lengths may then be angles: --sigma 0.4mas", type=float, metavar="ARCSEC"
-    ),
-    "terms": Option(
-        f"what displaces stars and will be found too, and its size: {', '.join(words.SIZED_TERMS)}=SIZE:LENGTH"
-        "[:SMOOTHNESS[:RATIO:ANGLE]]",
-        "--term",
-        type=sized_terms(words.SIZED_TERMS),
-        action="extend",
-        metavar="NAME=SIZE,...",
-    ),
-    "tan_z": Option("of the zenith distances of the exposures", type=float, nargs="+", metavar="TAN"),
-    "parallactic_angle": Option("of the exposures, degrees", type=float, nargs="+", metavar="DEG"),
-    "seed": Option("of stars and shifts that are drawn (default 0)", type=int),
 }

@@ -5,7 +5,7 @@
 
 from dataclasses import dataclass
 
-from . import options
+from . import options, planning_options
 
 
 @dataclass(frozen=True)
@@ -146,9 +146,12 @@ COMMANDS = {
     "predict": _command(
         "expected errors of a planned set of exposures",
         "--n-exposures 11 --n-stars 80 --sigma 0.02 --degree 3",
-        options.PREDICTING,
+        planning_options.PREDICTING,
+        planning_options.INSTRUMENT,
+        planning_options.EXPOSURES,
         options.CAMERA,
         options.picture("map of the error over the field"),
+        planning_options.PICTURE_OF_ERRORS,
         options.REPLACING,
         options.TABLE,
     ),

@@ -302,7 +302,7 @@ def plot_scatter(solution, *, label="scatter of one star", color=elements.BLUE, 
     return ax
 
 
-def plot_sigma_map(x, y, sigma, *, stars=None, ax=None):
+def plot_sigma_map(x, y, sigma, *, stars=None, unit="px", ax=None):
     """Map of the error of a corrected position (the paper's Figure "ergrid").
 
     Drawn by ``plot_sigma_map(*view.sigma_map())``.
@@ -312,9 +312,11 @@ def plot_sigma_map(x, y, sigma, *, stars=None, ax=None):
     x, y : array_like, shape (n_x,), (n_y,)
         Pixels of the detector, increasing.
     sigma : array_like, shape (n_y, n_x) or (n_y, n_x, 2)
-        Error per axis, pixels (of two axes their rms is shown); NaN where no star supports the correction.
+        Error per axis (of two axes their rms is shown); NaN where no star supports the correction.
     stars : array_like, shape (n, 2), optional
         Positions of the stars that were fitted, drawn as crosses.
+    unit : str
+        Of the errors, for the label.
     ax : `~matplotlib.axes.Axes`, optional
         Where to draw.
 
@@ -341,7 +343,7 @@ def plot_sigma_map(x, y, sigma, *, stars=None, ax=None):
         shading="nearest",
         rasterized=True,
     )
-    ax.figure.colorbar(picture, ax=ax, label="error per axis [px]", extend="max", shrink=0.85)
+    ax.figure.colorbar(picture, ax=ax, label=f"error per axis [{unit}]", extend="max", shrink=0.85)
     if stars is not None:
         ax.plot(*np.asarray(stars, dtype=float).T, "x", color="white", markersize=7, mew=3)
         ax.plot(*np.asarray(stars, dtype=float).T, "x", color="black", markersize=6, mew=1)

@@ -148,19 +148,31 @@ class GriddedPSF:
         along = sum(weight[:, None] * coefficients[index] for index, weight in zip(y, in_y, strict=True))
         return sum(weight * along[:, index] for index, weight in zip(x, in_x, strict=True))
 
-    def information(self, flux, *, sky, gain, read_noise):
-        """Fisher information on a coordinate, the mean of x and y, of stars of these fluxes (n,) [1 / pixel^2]."""
-        xy, half, step = np.mean(self.positions, axis=0), int(np.ceil(4 * self.fwhm)), 1e-3
-        pixels = np.arange(-half, half + 1) + np.round(xy).astype(int)[:, None]
-        light = self.on_pixels(*pixels, xy)
-        moved = (self.on_pixels(*pixels, xy + step * e) - self.on_pixels(*pixels, xy - step * e) for e in np.eye(2))
-        slope2 = sum(np.square(difference / (2 * step)) for difference in moved) / 2
-        variance = (sky + flux[..., None, None] * light) / gain + (read_noise / gain) ** 2
-        return np.sum(flux[..., None, None] ** 2 * slope2 / variance, axis=(-2, -1))
+    def information(self, flux, *, sky, gain, read_noise, phases=1):
+        """Fisher information on a coordinate, the mean of x and y, of stars of these fluxes (n,) [1 / pixel^2].
+
+        Of stars in the middle of a pixel, or the mean over `phases` by `phases` places on it.
+        """
+        half, step, flux = int(np.ceil(4 * self.fwhm)), 1e-3, flux[..., None, None]
+        middle = np.round(np.mean(self.positions, axis=0))
+        pixels, total = np.arange(-half, half + 1) + middle.astype(int)[:, None], 0.0
+        for xy in middle + places_on_pixel(phases):
+            light = self.on_pixels(*pixels, xy)
+            moved = (self.on_pixels(*pixels, xy + step * e) - self.on_pixels(*pixels, xy - step * e) for e in np.eye(2))
+            slope2 = sum(np.square(difference / (2 * step)) for difference in moved) / 2
+            variance = (sky + flux * np.maximum(light, 0)) / gain + (read_noise / gain) ** 2
+            total = total + np.sum(flux**2 * slope2 / variance, axis=(-2, -1))
+        return total / phases**2
 
     def __repr__(self):
         n, ny, nx = self.data.shape
         return f"<GriddedPSF: {n} of {ny} x {nx} samples, oversampling {self.oversampling}, FWHM {self.fwhm:.2f} px>"
+
+
+def places_on_pixel(n):
+    """n by n places that lie evenly on a pixel, from its middle, (n^2, 2) [pix]."""
+    along = (np.arange(n) - (n - 1) / 2) / n
+    return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
 
 
 def _taps(at, n):

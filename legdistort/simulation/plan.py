@@ -21,6 +21,8 @@ from ..runtime.checks import check_counts, check_positive
 from ..solving.equations.problem import as_given
 from ..solving.terms.term import RandomField, Term, listed
 from . import observations, truth
+from .instruments import star_counts
+from .instruments.instrument import Instrument
 
 #: What is stated of the exposures for terms.
 OF_EXPOSURES = "tan_z", "parallactic_angle"
@@ -59,8 +61,11 @@ class Plan:
     terms: tuple[Term | RandomField, ...] = ()
     tan_z: Any = None
     parallactic_angle: Any = None
+    instrument: Instrument | None = None
 
     def __post_init__(self) -> None:
+        for name, value in self._of_instrument().items():
+            object.__setattr__(self, name, value)
         for name, value in zip(("shape", "prior"), self._field(), strict=True):
             object.__setattr__(self, name, value)
         self._check_epochs()
@@ -85,6 +90,27 @@ class Plan:
             check_counts(n_stars=self.n_stars)
         if self.density is not None and not (isinstance(self.density, Real) and 0 < self.density < np.inf):
             raise InputError(f"density must be a positive number of stars a detector, got {self.density!r}")
+
+    def _of_instrument(self):
+        """What an instrument states, the camera and its scale; stars have magnitudes then, and no errors."""
+        if self.instrument is None:
+            if self.has_counts:
+                raise InputError("stars is a luminosity function, which needs an instrument: give instrument")
+            return {}
+        if not isinstance(self.instrument, Instrument):
+            raise InputError(f"instrument must be a legdistort.Instrument, got {as_given(self.instrument)}")
+        stated = {name: getattr(self.instrument, name) for name in ("camera", "pixel_scale")}
+        for name, value in stated.items():
+            if getattr(self, name) not in (None, value):
+                raise InputError(f"{name} is stated by the instrument: leave it out")
+        if self.sigma is not None:
+            raise InputError("sigma and instrument both state the errors: leave one out")
+        if not self.has_counts and not (isinstance(self.stars, Table) and "mag" in self.stars.colnames):
+            raise InputError(
+                "an instrument measures stars of magnitudes: give stars as a table with x, y and mag, or as a "
+                "luminosity function, with mag and density"
+            )
+        return stated
 
     def _field(self):
         """Shape and prior: the focal plane of a camera takes the place of the detector, and it is the prior."""
@@ -113,6 +139,11 @@ class Plan:
             raise InputError(f"field must be the place on the sky as one SkyCoord, got {self.field!r}")
 
     @property
+    def has_counts(self) -> bool:
+        """Whether the stars are to be drawn from a luminosity function."""
+        return isinstance(self.stars, Table) and star_counts.is_counts(self.stars)
+
+    @property
     def has_focal_plane(self) -> bool:
         """Whether detectors lie in a focal plane, see `Camera.has_focal_plane`."""
         return bool(self.camera) and self.camera.has_focal_plane
@@ -138,7 +169,8 @@ class Plan:
 
     def columns(self, n: int) -> dict[str, np.ndarray]:
         """Columns that terms need, of n stars in every exposure: ``{name: (n_exposures, n)}``."""
-        stars, made = self.stars if isinstance(self.stars, Table) else Table(), {}
+        listed_stars = isinstance(self.stars, Table) and not self.has_counts
+        stars, made = self.stars if listed_stars else Table(), {}
         for name in dict.fromkeys(name for term in self.terms for name in getattr(term, "needs", ())):
             found = column_contract.colour_column(stars) if name == "colour" else name
             if name in OF_EXPOSURES and getattr(self, name) is not None:
@@ -190,6 +222,8 @@ class Layout:
     columns : dict
         ``{name: (n_exposures, n_all)}`` that terms need.
     terms : tuple of Term or RandomField
+    mag : ndarray, shape (n_all,), or None
+        Magnitudes, of stars that an instrument measures.
     """
 
     positions: np.ndarray
@@ -201,6 +235,12 @@ class Layout:
     sky: TangentPlane | None = None
     columns: dict = field(default_factory=dict)
     terms: tuple = ()
+    mag: np.ndarray | None = None
+
+    @property
+    def stars(self):
+        """The stars as `predict` takes them again."""
+        return self.positions if self.mag is None else Table([*self.positions.T, self.mag], names=("x", "y", "mag"))
 
     @property
     def sigma(self):
@@ -254,15 +294,24 @@ def lay_out(plan):
         return np.array([truth.within(q, shape) for q in placed])
 
     region = truth.footprint(pose_list.values(), shape)
-    if plan.stars is not None:
+    mag = None
+    if plan.has_counts:
+        mag, positions = _draw_counts(plan, region, star_rng)
+    elif plan.stars is not None:
         positions = _positions(plan.stars)
+        mag = None if plan.instrument is None else column_contract.values(plan.stars, "mag", u.mag)
     elif plan.n_stars is not None:
         positions = truth.draw_stars(star_rng, plan.n_stars, region, inside, plan.least)
     else:
         sizes = [each.shape for each in plan.camera.detectors.values()] if plan.has_focal_plane else [shape]
         count = round(plan.density * np.prod(region[1] - region[0]) / np.mean(np.prod(sizes, axis=1)))
         positions = star_rng.uniform(*region, size=(count, 2))
-    observed = inside(positions)
+    planes = np.array([similarity.apply(pose, positions) for pose in pose_list.values()])
+    observed, (errors, measured) = inside(positions), _errors(plan, planes, mag)
+    if not (observed & measured).any() and observed.any():
+        bright, faint = plan.instrument.widest_limits
+        raise InputError(f"none of {len(positions)} stars is measured, from {bright:.2f} to {faint:.2f} mag")
+    observed &= measured
     observed &= np.count_nonzero(observed, axis=0) >= plan.least
     if not observed.any():
         raise InputError(
@@ -270,12 +319,17 @@ def lay_out(plan):
             f"the reference plane, here from {region[0].round()} to {region[1].round()} (x, y)"
         )
     years = None if plan.epochs is None else np.asarray(plan.epochs, dtype=float)
-    errors = _errors(plan, len(positions))
     if plan.has_focal_plane:
-        planes = [similarity.apply(pose, positions) for pose in pose_list.values()]
         errors = np.array([plan.camera.errors_in_focal_plane(f, e) for f, e in zip(planes, errors, strict=True)])
     columns = plan.columns(len(positions))
-    return Layout(positions, pose_list, shape, observed, errors, years, plan.sky, columns, plan.terms)
+    return Layout(positions, pose_list, shape, observed, errors, years, plan.sky, columns, plan.terms, mag)
+
+
+def _draw_counts(plan, region, rng):
+    """Magnitudes (n,) and positions (n, 2) of the stars of a luminosity function that are measured somewhere."""
+    area = float(np.prod(region[1] - region[0])) * plan.pixel_scale**2
+    mag = star_counts.draw_magnitudes(plan.stars, area, plan.instrument.widest_limits, rng)
+    return mag, rng.uniform(*region, size=(len(mag), 2))
 
 
 def _sized(term):
@@ -340,7 +394,20 @@ def _positions(stars):
     return xy
 
 
-def _errors(plan, n):
+def _errors(plan, planes, mag):
+    """Errors (n_exposures, n, 2) of stars at the places (n_exposures, n, 2), and which are measured, (n_exposures, n).
+
+    Stated, from the columns of the table of stars, or from magnitudes by an instrument.
+    """
+    if plan.instrument is not None:
+        places = (planes - (np.array(plan.shape[::-1]) - 1) / 2) * plan.pixel_scale
+        errors = np.array([plan.instrument.position_error(mag, at=each) for each in places])
+        measured = np.array([plan.instrument.measures(mag, at=each) for each in places])
+        return np.stack([errors, errors], axis=-1), measured
+    return _stated_errors(plan, planes.shape[1]), True
+
+
+def _stated_errors(plan, n):
     """Errors (n_exposures, n, 2) of n stars, stated or from the columns of the table of stars."""
     sigma, stars = plan.sigma, plan.stars
     columns = stars.colnames if isinstance(stars, Table) else ()

@@ -19,18 +19,21 @@ from ..matching.matches import alone
 from ..results import accuracy
 from ..results.errors.absolute_errors import relative_blocks
 from ..results.solution import Solution
+from ..runtime.checks import check_positive
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..solving import star_motions
 from ..solving.equations.problem import build_problem
 from ..solving.options import SolveOptions
+from . import magnitudes
 from .aliasing import alias, assumed_spectra
 from .noiseless_solution import noiseless_solution
 from .plan import Plan, lay_out
-from .prediction_text import decimals, describe, finite_rms
+from .prediction_text import decimals, describe, finite_rms, unit_of
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
+    from astropy.table import QTable
     from matplotlib.axes import Axes
     from numpy.typing import ArrayLike
 
@@ -38,6 +41,7 @@ if TYPE_CHECKING:
     from ..priors.prior import Prior
     from ..runtime.annotations import Shape
     from ..solving.terms.term import RandomField, Term
+    from .instruments.instrument import Instrument
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +75,8 @@ class Prediction(ShownAsPrinted):
     error_map, alias_map : ndarray, shape (n_y, n_x)
         Scatter sigma_j' over the field (the paper's Figure "ergrid"), NaN where fewer than two exposures see it; and
         that from aliasing.
+    correction_map : ndarray, shape (n_y, n_x)
+        The part of the scatter that the correction has, whatever the error of a new position, aliasing aside.
     contour : ndarray, shape (2, 2)
         Lower and upper corner of the square.
     folded : ndarray, shape (2, n_modes)
@@ -93,6 +99,7 @@ class Prediction(ShownAsPrinted):
     y: np.ndarray
     error_map: np.ndarray
     alias_map: np.ndarray
+    correction_map: np.ndarray
     contour: np.ndarray
     folded: np.ndarray
     spectrum: np.ndarray
@@ -128,6 +135,12 @@ class Prediction(ShownAsPrinted):
     def s_sigma(self) -> float:
         """Slope of the noise propagation on corrected positions, sigma / sigma_meas (paper, section 4.2)."""
         return self.sigma / self.sigma_meas
+
+    @property
+    def sigma_correction(self) -> float:
+        """The part of `sigma` that the correction has, whatever the error of a new position."""
+        grid = np.stack(np.meshgrid(self.x, self.y), axis=-1).reshape(-1, 2)
+        return finite_rms(self.correction_map.ravel()[accuracy.in_contour(grid, self.contour)])
 
     @property
     def b_total(self) -> float:
@@ -175,19 +188,60 @@ class Prediction(ShownAsPrinted):
     def plot(self, *, ax: Axes | None = None) -> Axes:
         """Map of the expected scatter of new positions, aliasing included, with stars and contour; returns the axes.
 
-        The paper's Figure "ergrid". Of more than 300 stars none are drawn.
+        The paper's Figure "ergrid". With an instrument new positions have no error that is common to all, and the
+        part is shown that the correction has. Of more than 300 stars none are drawn.
         """
         from ..plots import elements, solution_plots
 
-        stars = self.solution.estimate.positions
-        total = np.hypot(self.error_map, self.alias_map)
-        ax = solution_plots.plot_sigma_map(self.x, self.y, total, stars=stars if len(stars) <= 300 else None, ax=ax)
+        stars, (unit, scale) = self.solution.estimate.positions, unit_of(self)
+        shown, what = (
+            (self.correction_map, "Error of the correction")
+            if self.settings.instrument
+            else (self.error_map, "Expected scatter")
+        )
+        total = scale * np.hypot(shown, self.alias_map)
+        ax = solution_plots.plot_sigma_map(
+            self.x, self.y, total, stars=stars if len(stars) <= 300 else None, unit=unit, ax=ax
+        )
         (x0, y0), (x1, y1) = self.contour
         ax.plot([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], color=elements.RED, linewidth=1.8)
-        elements.set_title(
-            ax, f"Expected scatter: {self.n_exposures} exposures, {self.n_stars} stars, degree {self.degree}"
-        )
+        elements.set_title(ax, f"{what}: {self.n_exposures} exposures, {self.n_stars} stars, degree {self.degree}")
         return ax
+
+    def by_magnitude(self, step: float = 1.0) -> QTable:
+        """Median errors in bins of magnitudes, where the stars have magnitudes.
+
+        Parameters
+        ----------
+        step : float
+            Width of a bin.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            ``mag`` (middle), ``n`` stars, ``error`` of a position in one exposure and ``joint_error`` of a star in the
+            solution, relative, per axis: mas, or pixels where the scale is not known.
+
+        Raises
+        ------
+        InputError
+            If the stars have no magnitudes.
+        """
+        check_positive(step, "step", "number of magnitudes")
+        return magnitudes.by_magnitude(self, step)
+
+    def plot_errors(self, *, ax: Axes | None = None) -> Axes:
+        """Error of a position against magnitude, in one exposure and joint (`by_magnitude`); returns the axes."""
+        from ..plots import planning_plots
+
+        instrument = self.settings.instrument
+        return planning_plots.plot_errors(
+            magnitudes.star_errors(self), self.by_magnitude(0.5),
+            limits=None if instrument is None else instrument.limits,
+            title=f"{'' if instrument is None else instrument.name + ': '}{self.n_exposures} exposures, "
+            f"{self.n_stars} stars, degree {self.degree}",
+            ax=ax,
+        )  # fmt: skip
 
     def alternatives(self) -> Table:
         """The same stars with half and twice the exposures, and fitted one degree lower and higher, as a table.
@@ -260,6 +314,7 @@ def predict(
     terms: Term | RandomField | Iterable[Term | RandomField] = (),
     tan_z: ArrayLike | None = None,
     parallactic_angle: ArrayLike | None = None,
+    instrument: Instrument | None = None,
     n_grid: int = 50,
     seed: int = 0,
 ) -> Prediction:
@@ -309,8 +364,8 @@ def predict(
     field : `~astropy.coordinates.SkyCoord`, optional
         Where it lies: parallaxes are fitted too.
     pixel_scale : float, optional
-        Arcsec: lengths may be given as angles then (``0.4 * u.mas``), and the printed errors are angles. Attributes and
-        maps stay in pixels.
+        Arcsec: lengths may be given as angles then (``0.4 * u.mas``), and errors are angles where they are printed or
+        drawn. Attributes stay in pixels.
     terms : Term, or a list of them, optional
         What displaces stars beside the distortion and will be found with it, as `legdistort.solve` takes them, but with
         their sizes: ``Term.named("pixel_phase", sigma=0.03)``, ``Term.named("turbulence", size=0.1, length=200)``.
@@ -318,6 +373,11 @@ def predict(
         is as large as such fields make it. Columns that a term needs (`Term.needs`) are those of `stars`.
     tan_z, parallactic_angle : array_like, shape (n_exposures,), optional
         Tangent of the zenith distance, and degrees, of the exposures, which "refraction" needs.
+    instrument : Instrument, optional
+        In the place of `sigma`, `camera`, `shape` and `pixel_scale`: errors come from magnitudes, and stars that are
+        too bright or too faint are not measured. `stars` then is a table with ``x``, ``y``, ``mag``, or a luminosity
+        function to draw them from, evenly over the field: ``mag`` and ``density``, stars a magnitude and square arcmin
+        (or arcsec, by its unit), linear in between.
     n_grid : int
         Points of the maps along the longer side.
     seed : int
@@ -336,6 +396,7 @@ def predict(
 
     See Also
     --------
+    legdistort.Instrument : Errors from magnitudes.
     legdistort.simulate_matches : Draw such observations.
     legdistort.solve : Solve them.
 
@@ -356,7 +417,7 @@ def predict(
         shape=shape, dithers=dithers, poses=poses, prior=prior, dynamic=dynamic, spectrum=spectrum,
         static_spectrum=static_spectrum, min_exposures=min_exposures, n_grid=n_grid, seed=seed,
         epochs=epochs, field=field, camera=camera, pixel_scale=pixel_scale, terms=terms, tan_z=tan_z,
-        parallactic_angle=parallactic_angle,
+        parallactic_angle=parallactic_angle, instrument=instrument,
     )  # fmt: skip
     return _predict(plan)
 
@@ -393,7 +454,7 @@ def _predict(plan):
         folded, b_alias = aliasing.folded, float(np.sqrt(np.mean(aliasing.stars)))
     square = accuracy.contour(solution.estimate.positions)
     inside = accuracy.in_contour(grid, square)
-    drawn = {"stars": layout.positions, "n_stars": None, "density": None} if plan.stars is None else {}
+    drawn = {"stars": layout.stars, "n_stars": None, "density": None} if plan.stars is None or plan.has_counts else {}
     return Prediction(
         solution=solution,
         sigma_meas=layout.sigma,
@@ -407,6 +468,7 @@ def _predict(plan):
         y=y,
         error_map=noise.reshape(len(y), len(x)),
         alias_map=aliased.reshape(len(y), len(x)),
+        correction_map=accuracy.expected_scatter(solution, grid, 0.0, covariance=errors).reshape(len(y), len(x)),
         contour=square,
         folded=folded,
         spectrum=independent,

@@ -12,7 +12,7 @@ def decimals(prediction, scale=1.0):
     return max(4 if scale == 1 else 0, 3 - int(np.floor(np.log10(scale * prediction.sigma_meas))))
 
 
-def _unit(prediction):
+def unit_of(prediction):
     """The unit in which errors are shown, and its number in a pixel."""
     scale = prediction.settings.pixel_scale
     return ("px", 1.0) if scale is None else ("mas", 1e3 * scale)
@@ -26,12 +26,12 @@ def finite_rms(values):
 
 def describe(prediction):
     """A `Prediction` as ``print`` shows it: both criteria, aliasing where any is assumed, slopes and rules of thumb."""
-    solution = prediction.solution
+    solution, instrument = prediction.solution, prediction.settings.instrument
     ny, nx = solution.estimate.shapes[solution.names[0]]
     low, high = prediction.stars_per_exposure.min(), prediction.stars_per_exposure.max()
     thumb_b, thumb_sigma = prediction.thumb
     aliased = np.any(prediction.folded != 0)  # NaN included
-    unit, scale = _unit(prediction)
+    unit, scale = unit_of(prediction)
     places = decimals(prediction, scale)
 
     def row(label, noise, aliasing=None, *slopes):
@@ -57,13 +57,28 @@ def describe(prediction):
             row("b, star positions, relative", *b, prediction.s_b, thumb_b),
             row(_absolute(prediction), prediction.b_abs),
             row("sigma, new positions inside the contour", *sigma, prediction.s_sigma, thumb_sigma),
+            *([row("of this the error of the correction", prediction.sigma_correction)] * bool(instrument)),
             row("sigma, new positions over the whole field", prediction.sigma_field, finite_rms(prediction.alias_map)),
             *(row(_MOTIONS[name].format(unit), error) for name, error in prediction.motion_errors.items()),
             *(f"found beside, of the size that is stated: {term!r}" for term in prediction.settings.terms),
+            *_by_magnitude(prediction),
             *textwrap.wrap(f"All but b, absolute, are relative: {_relative(prediction)}", 110),
             f"gauge {solution.gauge.kind}; thumb: s_b = 1/sqrt(n_im), s_sigma = sqrt((1 - 1/n_im)(1 + n_modes/n_star))",
         ]
     )
+
+
+def _by_magnitude(prediction):
+    """What an instrument measures, and the errors by magnitude."""
+    instrument = prediction.settings.instrument
+    if instrument is None:
+        return
+    bright, faint = instrument.limits
+    from_bright = f"from {bright:.2f} " if np.isfinite(bright) else ""
+    yield f"{repr(instrument)[1:-1]}: stars {from_bright}to {faint:.2f} mag"
+    yield f"{'mag':>8s}{'stars':>8s}{'one exposure [mas]':>22s}{'joint [mas]':>15s}"
+    for mag, n, error, joint in prediction.by_magnitude().iterrows():
+        yield f"{mag:8.1f}{n:8d}{error.value:22.4g}{joint.value:15.4g}"
 
 
 def _absolute(prediction):

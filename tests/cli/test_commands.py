@@ -24,7 +24,7 @@ from astropy.wcs import WCS
 
 import legdistort
 from legdistort import Prior, Solution, calibrate_noise, coadd, match, measure, open_exposures, pipeline, predict, solve
-from legdistort.cli import commands, options, parser
+from legdistort.cli import commands, options, parser, planning_options
 from legdistort.cli.arguments import given, planes
 from legdistort.cli.parser import main
 from legdistort.cli.running import in_shell_words
@@ -504,7 +504,9 @@ def test_help_has_an_example(command, capsys):
         (coadd, [options.COADDING, options.WORKERS, options.GRID]),
         (legdistort.catalogue, [options.CATALOGUING, options.ARTIFICIAL, options.COMPLETENESS]),
         (attach, [options.FRAMES, options.ATTACHING]),
-        (predict, [options.PREDICTING]),
+        (predict, [planning_options.PREDICTING]),
+        (legdistort.Instrument.named, [planning_options.INSTRUMENT]),
+        (legdistort.Instrument, [planning_options.EXPOSURES]),
         (Prior.from_model, [options.EXPANDING]),
         (Solution.read, [options.SOLUTION]),
         (legdistort.combine_nights, [options.NIGHTS, options.WORKERS]),
@@ -658,6 +660,7 @@ FILES = {
     "coadd's solution": "coadd other.fits --solution IN --out OUT",
     "coadd's grid": "coadd other.fits --solution s.asdf --grid IN --out OUT",
     "predict": "predict --n-exposures 4 --stars IN --plot OUT",
+    "predict's PSF": "predict --n-exposures 4 --stars other.ecsv --instrument NIRC2 --psf IN --plot-errors OUT",
     "nights": "nights IN --out OUT",
     "nights's plot": "nights IN --out elsewhere.asdf --plot OUT",
     "difference": "difference IN s.asdf --plot OUT",
@@ -685,7 +688,7 @@ def _ready(monkeypatch, line, *, read, out):
 
 @pytest.mark.parametrize("line", FILES.values(), ids=FILES)
 def test_files_that_cannot_be_written(line, tmp_path, capsys, monkeypatch):
-    command = "plot" if "--plot OUT" in line else line.split()[0]
+    command = "plot" if re.search("--plot(-errors)? OUT", line) else line.split()[0]
     endings = {
         "plot": ".png",
         "coadd": ".fits",

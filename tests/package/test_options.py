@@ -31,12 +31,14 @@ from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.inputs.exposures import Exposure
 from legdistort.matching.matcher import match
 from legdistort.matching.matches import Matches
+from legdistort.measurement.effective.model import EffectivePSF
 from legdistort.measurement.positions import measure
 from legdistort.priors.prior import Prior
 from legdistort.reporting.page import write_report
 from legdistort.results.accuracy import known_offsets
 from legdistort.results.solution import Solution
 from legdistort.results.view import View
+from legdistort.simulation.instruments.instrument import Instrument
 from legdistort.simulation.observations import simulate_matches
 from legdistort.simulation.prediction import predict
 from legdistort.solving.estimation import solve
@@ -406,6 +408,12 @@ REPORT = [
     row(exposures=frames),
 ]
 STARS = np.random.default_rng(3).uniform([0, 0], [120, 80], (40, 2))
+BRIGHT = Table({"x": STARS[:, 0], "y": STARS[:, 1], "mag": np.linspace(12, 18, 40)})
+ROUND = EffectivePSF.from_array(np.exp(-np.sum(np.mgrid[-20:21, -20:21] ** 2, axis=0) / 50), oversampling=4)
+INSTRUMENT = Instrument(
+    camera=Camera("one", {"1": Detector(SHAPE)}), pixel_scale=0.02, psf=ROUND, exposure_time=10, zero_point=26.0,
+    sky_brightness=14.0, read_noise=10.0,
+)  # fmt: skip
 COLOURED = Table({"x": STARS[:, 0], "y": STARS[:, 1], "colour": np.linspace(-1, 2, 40)})
 PREDICT = [
     row(stars=STARS),
@@ -416,6 +424,8 @@ PREDICT = [
     row(camera=lambda _: matches("pair").camera, shape=None),
     row(dithers=10.0),
     row(pixel_scale=0.02),
+    row(instrument=INSTRUMENT, stars=BRIGHT, sigma=None, shape=None),
+    row(instrument=INSTRUMENT, refused={"": "sigma and instrument both state the errors"}),
     row(poses=lambda _: matches("plain").poses),
     row(prior=Prior(STATIC, sigma=0.1)),
     row(dynamic=0.1),

@@ -258,6 +258,14 @@ def test_the_figures_of_simulation_1():
     assert np.median(sigma) == pytest.approx(0.16, abs=0.01)
 
 
+def test_scatter_is_that_of_a_new_position_and_of_the_correction():
+    p = predict(n_exposures=5, n_stars=60, sigma=0.1, degree=2)
+    assert p.sigma**2 == pytest.approx(0.1**2 * (1 - 1 / 5) + p.sigma_correction**2, rel=1e-9)
+    assert_allclose(p.correction_map**2, p.error_map**2 - 0.1**2 * (1 - 1 / 5), rtol=1e-6)
+    # n modes of n stars, evenly over the field, are known that well
+    assert p.sigma_correction == pytest.approx(0.1 * np.sqrt((1 - 1 / 5) * 6 / 60), rel=0.1)
+
+
 def test_errors_are_proportional_to_the_noise():
     quiet, loud = (predict(n_exposures=5, n_stars=30, sigma=sigma, dithers=100.0) for sigma in (0.03, 0.28))
     for name in ("s_b", "s_sigma"):

@@ -4,6 +4,7 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
+from scipy import fft
 
 from ...exceptions import InputError
 from ...runtime.fits_bytes import open_fits
@@ -90,8 +91,9 @@ def read_psf(path):
     ----------
     path : str or path
         One that `EffectivePSF.write` made; of PSFEx (table ``PSF_DATA``); or oversampled images, (ny, nx) or (n, ny,
-        nx), with the keywords ``OVERSAMP`` and, for more than one, ``DET_YX0``, ... (as stpsf writes them) or
-        ``NXPSFS``, ``IPSFX01``, ``JPSFY01``, ... (STDPSF, oversampling 4).
+        nx), with the keywords ``OVERSAMP`` and, for more than one, ``DET_YX0``, ... (``psf_grid`` of stpsf) or
+        ``NXPSFS``, ``IPSFX01``, ``JPSFY01``, ... (STDPSF, oversampling 4). What ``calc_psf`` of stpsf writes
+        (extensions ``OVERSAMP``, ``OVERDIST``) is light on fine samples, and is added up over detector pixels here.
 
     Returns
     -------
@@ -153,8 +155,44 @@ def _from_psfex(table, path):
     return EffectivePSF(splines.coefficients(images) / total, step, variation, source=path.name)
 
 
+def on_samples(hdus):
+    """The HDU of ``calc_psf`` of stpsf that has the light of a star on fine samples, with the distortion if there."""
+    return next((hdus[name] for name in ("OVERDIST", "OVERSAMP") if name in [hdu.name for hdu in hdus]), None)
+
+
+def over_pixels(images, width, *, averaged=1):
+    """Light that falls into a pixel around every sample.
+
+    Parameters
+    ----------
+    images : ndarray, shape (..., ny, nx)
+        Light of a star on samples. It is taken as if its Fourier series were complete: samples finer than half of
+        wavelength / diameter.
+    width : float
+        Of a pixel, in samples.
+    averaged : int
+        Every sample is the mean of so many by so many finer ones already.
+
+    Returns
+    -------
+    ndarray, shape (..., ny, nx)
+        As `EffectivePSF.from_array` takes it, for ``oversampling=width``: `width` squared times the sums of `images`.
+    """
+    ny, nx = images.shape[-2:]
+    y, x = (
+        np.sinc(frequency * width) * np.sinc(frequency / averaged) / np.sinc(frequency)
+        for frequency in (fft.fftfreq(ny), fft.rfftfreq(nx))
+    )
+    return width**2 * fft.irfft2(fft.rfft2(images) * y[:, None] * x, s=(ny, nx))
+
+
 def _from_images(hdus, path):
     """Oversampled images with keywords of stpsf or STDPSF."""
+    fine = on_samples(hdus)
+    if fine is not None:
+        steps = _needed(fine.header, "OVERSAMP", path)
+        data = over_pixels(np.asarray(fine.data, dtype=float), steps)
+        return EffectivePSF.from_array(data, oversampling=steps, source=path.name)
     hdu = next((hdu for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) >= 2), None)
     if hdu is None:
         raise InputError(f"{path}: there is neither an image nor a table PSF_DATA in it")

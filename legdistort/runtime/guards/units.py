@@ -36,6 +36,11 @@ UNITS = {
     "parallactic_angle": (u.deg,),
     "pixel_scale": (u.arcsec, u.arcsec / u.pix),
     "zero_point": (u.mag,),
+    "mag": (u.mag,),
+    "sky_brightness": (u.mag / u.arcsec**2,),
+    "dark_current": (u.electron / u.s,),
+    "full_well": (u.electron,),
+    "psf_scale": (u.arcsec,),
 }
 #: These read units themselves.
 _OWN = frozenset({"reference_error", "data", "mask", "uncertainty"})
@@ -148,5 +153,7 @@ def _scale(given):
     """Arcsec a pixel, of the arguments of a function; None if nothing says it."""
     if given.get("pixel_scale") is not None:
         return given["pixel_scale"]
+    if hasattr(given.get("instrument"), "pixel_scale"):
+        return given["instrument"].pixel_scale
     skies = [getattr(value, "sky", None) for value in given.values()]
     return next((sky.pixel_scale for sky in skies if hasattr(sky, "pixel_scale")), None)

@@ -1,0 +1,1 @@
+"""What an instrument measures of stars of given magnitudes: presets, point-spread functions of files, star counts."""
