@@ -17,6 +17,7 @@ from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..inputs import column_contract
 from ..inputs.exposure_names import left_out_by
 from ..inputs.star_lists.given_dates import read_dates, with_dates
+from ..inputs.star_lists.list_images import with_own_dates
 from ..inputs.table_files import read_table, told_apart
 from ..priors.from_files import no_map
 from ..priors.prior import EVIDENCE, HEADER, HeaderPrior
@@ -64,7 +65,9 @@ def read_lists(a, contract):
     if 0 < sum(filled) < len(filled):
         log.info("these are %d of %d lists", sum(filled), len(filled))
     _warn_of_large_errors(read)
-    return read if a.dates is None else with_dates(read, read_dates(a.dates), a.dates)
+    if a.dates is not None:
+        return with_dates(read, read_dates(a.dates), a.dates)
+    return read if a.wcs else with_own_dates(read)
 
 
 def _errors(table):
