@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from types import SimpleNamespace
 
 import dense_model
 import drawn_sets
@@ -14,8 +15,10 @@ from numpy.testing import assert_allclose
 from scipy import stats
 
 import legdistort as ld
-from legdistort.exceptions import LegdistortWarning
+from legdistort.exceptions import InputError, LegdistortWarning
+from legdistort.geometry import basis
 from legdistort.solving.checks.limits import addition_that_shows
+from legdistort.solving.gauge import bent_reference
 
 
 def solved(seed, fault=None, *, prior=True, n=40, taken=None, **options):
@@ -265,6 +268,23 @@ def test_the_degree_that_is_named_cures(degree):
     cured = check_of(ld.solve(matches, prior=prior, reference=table, reference_degree=degree))
     assert cured.state in ("unknown", "pass")
     assert "agree with the exposures" in cured.sentence
+
+
+def test_no_degree_is_named_that_is_refused():
+    """Static distortions that headers give may have more modes than the fit, whose degree is the highest allowed."""
+    state = SimpleNamespace(positions=np.zeros((2, 60)), coefficients=np.zeros((8, 2, basis.n_modes(4))))
+    tried = []
+
+    def estimate(*_, **__):
+        tried.append(1)
+        raise InputError("no map")
+
+    stated, gauge = SimpleNamespace(with_bends=lambda maps: None), SimpleNamespace(n_fields=1)
+    known = stated, estimate, SimpleNamespace(state=state, gauge=gauge), SimpleNamespace(rows=np.arange(60))
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(bent_reference, "bends", lambda *_: None)
+        assert bent_reference.cure(*known, 0, 3) == {}
+    assert len(tried) == 3
 
 
 @pytest.mark.parametrize(
