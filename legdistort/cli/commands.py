@@ -35,6 +35,7 @@ from .given_files import (
     read_prior,
     refuse,
     sized_term,
+    stated_camera,
     without_options_of_prior,
 )
 from .repeating import repeatable
@@ -397,15 +398,8 @@ def do_stars(a):
 
 def do_camera(a):
     """``legdistort camera``."""
-    solution = _solution(a)
-    camera, errors = solution.camera, solution.estimate.uncertainty.camera
-    if not camera.has_focal_plane:
-        raise InputError(
-            f"{a.solution} is of images without a focal plane: legdistort nights {a.solution} --out {a.out} writes "
-            "what it found of their static distortion"
-        )
+    camera, unsettled = stated_camera(a)
     camera.write(a.out, overwrite=a.overwrite)
-    unsettled = "; it did not settle (check camera), and its errors do not hold" if errors and errors.unsettled else ""
     _say(a, f"{camera!r}"[1:-1] + f" in {a.out}{unsettled}", camera.to_dict())
 
 
