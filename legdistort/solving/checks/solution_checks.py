@@ -19,7 +19,7 @@ from ...results.errors.header_pointing import CURE as POINTING_CURE
 from ...results.gauge import warning_of
 from ..terms.observed import Observed
 from .camera_check import camera_check, contradicted_layout, undetermined
-from .cures import with_cures, without_static
+from .cures import with_cost, with_cures, without_static
 from .dynamic_check import EVIDENCE, dynamic_check, nights_check, significance
 from .extrapolated_maps import extrapolation_check
 from .limits import ALIKE, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
@@ -78,6 +78,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     may_be = contradicted is None and several and residuals.dof >= 1 and not has_fields
     if may_be and any(check.state in WRONG for check in made.values()):
         made, explained = with_cures(made, solution, residuals, observed, judged)
+        made = with_cost(made, residuals)
     camera = camera_check(
         solution,
         residuals,
