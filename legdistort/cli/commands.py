@@ -17,7 +17,7 @@ from ..exceptions import InputError
 from ..inputs import column_contract
 from ..inputs.detector_files import warn_of_detectors
 from ..inputs.star_lists.formats import stack
-from ..inputs.table_files import named_after, named_as_known, names_of_images, records, write_stars
+from ..inputs.table_files import named_after, named_as_known, names_of_images, records, shapes_for_match, write_stars
 from ..results.check import WRONG, Check, worst
 from ..runtime import outputs, parallel, provenance
 from ..runtime.trees.codec import from_tree
@@ -34,6 +34,7 @@ from .given_files import (
     read_lists,
     read_matches,
     refuse,
+    stated_camera,
     without_options_of_prior,
 )
 from .repeating import repeatable
@@ -170,12 +171,12 @@ def do_match(a):
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
     if camera:
         refuse({"shape": a.shape}, "comes from the camera of the run")
-    known = {"shape": tuple(a.shape) if a.shape and a.wcs is None else shapes or None, "camera": camera}
+    given_shape = tuple(a.shape) if a.shape and a.wcs is None else shapes_for_match(tables, shapes)
     if exposures is None and (exposures := measured_frames(read)) is not None:
         refuse({"shape": a.shape}, "comes from the frames")
     elif exposures is None and camera is None:
-        warn_of_detectors(names)
-    known |= {"exposures": exposures, "progress": wants_progress(a)}
+        warn_of_detectors(tables)
+    known = {"shape": given_shape, "camera": camera, "exposures": exposures, "progress": wants_progress(a)}
     with timed({}, "match"):
         matches = legdistort.match(stack(tables), **known, **given(a, options.MATCHING))
     seen = {*names, *(name for table in tables for name in table["exposure"])}
@@ -388,15 +389,8 @@ def do_stars(a):
 
 def do_camera(a):
     """``legdistort camera``."""
-    solution = _solution(a)
-    camera, errors = solution.camera, solution.estimate.uncertainty.camera
-    if not camera.has_focal_plane:
-        raise InputError(
-            f"{a.solution} is of images without a focal plane: legdistort nights {a.solution} --out {a.out} writes "
-            "what it found of their static distortion"
-        )
+    camera, unsettled = stated_camera(a)
     camera.write(a.out, overwrite=a.overwrite)
-    unsettled = "; it did not settle (check camera), and its errors do not hold" if errors and errors.unsettled else ""
     _say(a, f"{camera!r}"[1:-1] + f" in {a.out}{unsettled}", camera.to_dict())
 
 

@@ -16,12 +16,17 @@ from ..coaddition.grids import given_grid, read_grid
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..inputs import column_contract
 from ..inputs.exposure_names import left_out_by
+from ..inputs.frames.header_texts import headers_of, read_text
+from ..inputs.sky_wcs import image_wcs
 from ..inputs.star_lists.given_dates import read_dates, with_dates
+from ..inputs.star_lists.list_images import with_own_dates
 from ..inputs.table_files import read_table, told_apart
 from ..priors.from_files import no_map
 from ..priors.prior import EVIDENCE, HEADER, HeaderPrior
 from ..priors.storage import open_prior
 from ..runtime.asdf_files import entry_of
+from ..runtime.checks import check_is_file
+from ..runtime.fits_bytes import looks_like_fits
 from ..runtime.words import UNSTATED
 from ..solving.choices.degree_choice import AUTO, HIGHEST
 from ..solving.options import DEGREE
@@ -65,7 +70,9 @@ def read_lists(a, contract):
     if 0 < sum(filled) < len(filled):
         log.info("these are %d of %d lists", sum(filled), len(filled))
     _warn_of_large_errors(read)
-    return read if a.dates is None else with_dates(read, read_dates(a.dates), a.dates)
+    if a.dates is not None:
+        return with_dates(read, read_dates(a.dates), a.dates)
+    return read if a.wcs else with_own_dates(read)
 
 
 def _errors(table):
@@ -119,6 +126,48 @@ def _given_instrument(a):
         if needed not in words:
             raise InputError(f"--instrument needs --{needed.replace('_', '-')} too")
     return legdistort.Instrument.named(**words)
+
+
+def stated_camera(a):
+    """The camera of ``legdistort camera``, that of a solution or by the headers of a frame, and a caution in words.
+
+    Raises
+    ------
+    InputError
+        For images without a focal plane, and for a text that has not one header for every image.
+    """
+    if Path(a.solution).is_dir() or not _is_frame(a.solution):
+        refuse({"ext": a.ext, "headers": a.headers}, "is for a frame")
+        solution = legdistort.Solution.read(a.solution, max_bytes=a.max_bytes)
+        if not solution.camera.has_focal_plane:
+            raise InputError(
+                f"{a.solution} is of images without a focal plane: legdistort nights {a.solution} --out {a.out} writes "
+                "what it found of their static distortion"
+            )
+        errors = solution.estimate.uncertainty.camera
+        words = "; it did not settle (check camera), and its errors do not hold" if errors and errors.unsettled else ""
+        return solution.camera, words
+    exposures = legdistort.read_exposures([a.solution], ext=a.ext)
+    if a.headers is not None:
+        headers = headers_of(read_text(Path(a.headers)))
+        if len(headers) != len(exposures):
+            raise InputError(
+                f"{a.headers} has {len(headers)} headers, and {a.solution} {len(exposures)} images: give the text of "
+                "this frame, or choose the images (--ext)"
+            )
+        exposures = [
+            replace(exposure, wcs=image_wcs(header, None)) for exposure, header in zip(exposures, headers, strict=True)
+        ]
+    if len(exposures) < 2:
+        raise InputError(
+            f"{a.solution} has one image: legdistort prior {a.headers or a.solution} --out {a.out} writes that"
+        )
+    return legdistort.Camera.from_exposures(exposures), "; errors are not known"
+
+
+def _is_frame(path):
+    check_is_file(path)
+    return looks_like_fits(Path(path))
 
 
 def read_matches(a):

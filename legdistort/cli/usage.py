@@ -21,6 +21,19 @@ def _command(what, example, *groups):
     return Command(what, example, (options.COMMON, *groups))
 
 
+#: Of ``camera``, which takes a solution or a frame.
+_CAMERA_SOURCE = {
+    "solution": options.Option(
+        "solution.asdf or its folder, or a frame with all its detectors", "solution", path="read"
+    ),
+    "ext": options.Option("extensions of a frame that are its detectors: name, or pattern", type=options.extension),
+    "headers": options.Option(
+        "headers that take the place of those of the frame, one for every image, as SCAMP writes them (.head)",
+        metavar="TEXT",
+        path="read",
+    ),
+}
+
 #: The commands by name, in the order of the help.
 COMMANDS = {
     "demo": _command(
@@ -197,9 +210,9 @@ COMMANDS = {
         options.AT_EPOCH,
     ),
     "camera": _command(
-        "the camera that a solution found as a file, to be shared",
+        "the camera that a solution found, or that the headers of a frame state, as a file",
         "results/solution.asdf --out camera.asdf",
-        options.SOLUTION,
+        options.SOLUTION | _CAMERA_SOURCE,
         options.out("camera file (ASDF), for --camera"),
     ),
     "correct": _command(

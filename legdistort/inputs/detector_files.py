@@ -128,8 +128,9 @@ def named_detectors(names):
     return (sorted(keys), sorted(whole)) if len(keys) > 1 and len(whole) < len(names) else ([], [])
 
 
-def warn_of_detectors(names):
-    """Warn where names of exposures are of several detectors of the same (`named_detectors`), and nothing else is."""
+def warn_of_detectors(tables):
+    """Warn where tables without detectors have exposures named after several detectors of the same, and no others."""
+    names = [name for table in tables if "detector" not in table.colnames for name in dict.fromkeys(table["exposure"])]
     keys, whole = named_detectors(names)
     if keys:
         warn(

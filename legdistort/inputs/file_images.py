@@ -5,6 +5,7 @@ import logging
 import re
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from types import SimpleNamespace
 
 from astropy.io import fits
 
@@ -129,6 +130,49 @@ def detectors_of(images):
         return None
     own = own if name else [key for key in own if key == "DETSEC"]
     return (name, own[0]) if own else None
+
+
+def detectors_of_headers(headers):
+    """Ids of the detectors of one exposure by the headers of its images alone, as those of a file have them.
+
+    Parameters
+    ----------
+    headers : list of Header
+        Of images that were all asked for.
+
+    Returns
+    -------
+    list of str
+        Empty where they are not told to be detectors: neither by `detectors_of`, nor by one name for all and a keyword
+        that tells them apart.
+    str
+        The keyword that tells it.
+    """
+    images = [
+        SimpleNamespace(
+            name=str(h.get("EXTNAME", "")).strip().upper(), ver=h.get("EXTVER", 1), header=h,
+            shape=tuple(h.get(f"NAXIS{k}", 0) for k in (2, 1)),
+        )
+        for h in headers
+    ]  # fmt: skip
+    if len(images) < 2 or any(_stands_beside(image.name) for image in images):
+        return [], ""
+    told = detectors_of(images)
+    if told is None and len({image.name for image in images}) == 1 and images[0].name:
+        keyword = next((key for key in KEYWORDS if detector_ids(headers, [key])), None)
+        told = None if keyword is None else (images[0].name, keyword)
+    return ([], "") if told is None else ([key for _, key in _parts(dict(enumerate(images)))], told[1])
+
+
+def named_detector(header, ids):
+    """Which of the ids of detectors a header has by a keyword that may hold them, the first that does; else None."""
+    stated = (str(header.get(key, "")).strip() for key in _OF_ONE_FILE)
+    return next((each for each in stated if each and each in ids), None)
+
+
+def cards_of_detector(header):
+    """The cards of a header that may name its detector: ``{keyword: value}``."""
+    return {key: header[key] for key in ("DETSEC", *_OF_ONE_FILE) if isinstance(header.get(key), (str, int))}
 
 
 def _common_name(images):

@@ -16,7 +16,7 @@ from ..runtime import outputs, provenance
 from ..runtime.checks import check_is_file
 from . import column_contract, exposure_names
 from .plain_columns import for_fits, with_text
-from .star_lists import dialects, formats
+from .star_lists import dialects, formats, list_images
 
 log = logging.getLogger(__name__)
 
@@ -33,8 +33,9 @@ def read_table(path, *, columns=None, origin=None, error=None):
     ECSV, FITS (FITS_LDAC too), VOTable, IPAC, CSV, all also packed with gzip or bzip2; lists of SExtractor, FlyStar,
     hst1pass, DAOPHOT and photutils, whose columns are understood (`legdistort.inputs.star_lists.dialects`); and any
     other text whose columns are named in its first line or in a comment. A table without a column ``exposure`` is taken
-    for one exposure, named after the file; an LDAC file of several extensions, or a list of several chips, for as many,
-    ``NAME_1``, ``NAME_2`` ...
+    for one exposure, named after the file; an LDAC file of several extensions that its headers (``LDAC_IMHEAD``) tell
+    to be detectors of one camera gets a column ``detector``; another one, or a list of several chips, is taken for as
+    many exposures, ``NAME_1``, ``NAME_2`` ...
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ def read_table(path, *, columns=None, origin=None, error=None):
     -------
     `~astropy.table.Table`
         Pixels from 0; ``meta["inputs"]`` has the checksum of the file, ``meta["shapes"]`` the size of the image if
-        the file names.
+        the file names it, ``meta["images"]`` what else the header of the image states.
 
     Raises
     ------
@@ -108,9 +109,28 @@ def named_after(table, exposures, path):
     out = table.copy(copy_data=False)
     out["exposure"] = np.array([found[name][0] for name in labels.tolist()])
     out["exposure"].description = table["exposure"].description
-    if "detector" not in table.colnames and None not in (detectors := [found[name][1] for name in labels.tolist()]):
+    detectors = [found[name][1] for name in labels.tolist()]
+    if own := _by_image(table, found, exposures, path):
+        detectors = [own[name] for name in list_images.names_of_rows(table)]
+        out.remove_columns({"detector"} & set(out.colnames))
+        whole, shapes = out["exposure"][0], table.meta.get("shapes", {})
+        out.meta["shapes"] = {
+            exposure_names.detector_name(whole, own[name]): shapes[name] for name in own if name in shapes
+        }
+    if "detector" not in out.colnames and None not in detectors:
         out["detector"] = np.array(detectors, dtype=str)
     return out
+
+
+def _by_image(table, found, exposures, path):
+    """Detectors of frames by the images of an LDAC list, ``{name of an image: id}``; empty where names tell them."""
+    images = table.meta.get("images", {})
+    wholes = {whole for whole, detector in found.values() if detector is None}
+    ids = {whole: [e.detector for e in exposures if exposure_names.whole_name(e) == whole] for whole in wholes}
+    if not images or len(wholes) != 1 or len(wholes) < len(set(found.values())) or None in next(iter(ids.values())):
+        return {}
+    ((whole, known),) = ids.items()
+    return list_images.detectors_by_frames(images, whole, known, path)
 
 
 def told_apart(tables):
@@ -161,6 +181,29 @@ def names_of_images(tables):
     return list(origins)
 
 
+def shapes_for_match(tables, shapes):
+    """Shapes by detector, where all tables distinguish these, else as they are, by exposure; None for none.
+
+    Raises
+    ------
+    InputError
+        For a detector that has two.
+    """
+    if not all("detector" in table.colnames for table in tables):
+        return shapes or None
+    out = {}
+    for table in tables:
+        for name, detector in zip(
+            list_images.names_of_rows(table), np.asarray(table["detector"]).astype(str), strict=True
+        ):
+            if name in shapes and out.setdefault(str(detector), shapes[name]) != shapes[name]:
+                raise InputError(
+                    f"detector {detector} has {shapes[name]} pixels (ny, nx) in {name} and {out[str(detector)]} "
+                    "elsewhere: match the lists of one readout apart"
+                )
+    return out or None
+
+
 def with_mark(table, mark, path):
     """The table of a file with something before the names of its exposures, and of the file itself."""
     if not mark:
@@ -171,7 +214,7 @@ def with_mark(table, mark, path):
     )
     for name in set(out["exposure"]):
         exposure_names.check_exposure_name(name, path)
-    for key in {"shapes"} & set(out.meta):
+    for key in {"shapes", "images"} & set(out.meta):
         out.meta[key] = {mark + name: each for name, each in out.meta[key].items()}
     out.meta["inputs"] = {mark * (name == path.name) + name: each for name, each in out.meta["inputs"].items()}
     return out
@@ -212,18 +255,23 @@ def _frame_of(name, frames):
 
 
 def _united(parts, path):
-    """One table of the parts of a file, ``{number: table}``, each an exposure of its own unless it has a name."""
-    shapes = {}
+    """One table of the parts of a file, ``{number: table}``: detectors of one exposure, or exposures of their own."""
+    shapes, images, detectors = {}, {}, list_images.detectors_of_tables(parts)
     for number, table in parts.items():
+        image = table.meta.pop("image", {})
         if "exposure" not in table.colnames:
-            name = exposure_names.list_name(path) + (f"_{number}" if number is not None else "")
+            apart = number is not None and number not in detectors
+            name = exposure_names.list_name(path) + (f"_{number}" if apart else "")
             exposure_names.check_exposure_name(name, path)
             table["exposure"] = Column(np.full(len(table), name), description=column_contract.OF_FILE)
-            if "shape" in table.meta:
-                shapes[name] = table.meta.pop("shape")
+            if number in detectors:
+                table["detector"] = np.full(len(table), detectors[number])
+                name = exposure_names.detector_name(name, detectors[number])
+            shape = table.meta.pop("shape", image.pop("shape", None))
+            shapes |= {} if shape is None else {name: shape}
+            images |= {name: image} if image else {}
     out = formats.stack(list(parts.values())) if len(parts) > 1 else next(iter(parts.values()))
-    if shapes:
-        out.meta["shapes"] = shapes
+    out.meta |= {key: value for key, value in (("shapes", shapes), ("images", images)) if value}
     return out
 
 

@@ -110,8 +110,8 @@ def match(
         Detections with any of these bits in ``flags`` are not used.
     isolation : float or None
         Largest ``crowding`` of a detection, see `legdistort.measurement.crowding`; deformed ones are left out too.
-        They still help to identify stars before that. None = all are kept. Tables without the column are
-        taken as they are.
+        They still help to identify stars before that. None = all are kept. Of tables without the column those with the
+        flag ``BLENDED`` are left out, if they are less than half.
     start : dict, `~astropy.table.Table` or path of a table, optional
         Where stars lie in the exposures: ``{exposure: (xshift, yshift)}``, pixels, or ``(xshift, yshift, rotation)``,
         degrees about the centre of the detector from x to y; columns ``exposure``, ``xshift``, ``yshift``,
@@ -199,10 +199,7 @@ def match(
             star, left_out = _label_over_gaps(table, names, shapes, headers, options, camera, edges)
         else:
             star, left_out = _label(table, names, shapes, headers, options, camera)
-    isolated = is_isolated(table, isolation)
-    if not isolated.all():
-        log.info("%d of %d detections are not isolated and left out", np.count_nonzero(~isolated), len(table))
-        star[~isolated] = -1
+    star[~_isolated(table, isolation)] = -1
     if camera is not None and len(names) > 1:
         _check_detectors(camera, table, star, shapes)
     tying = None if camera is None or len(names) == 1 else _ties_of_few(camera, table, star, min_exposures)
@@ -329,15 +326,27 @@ def _add_stated(table, named, keywords=None):
             table[column] = values * (u.deg if k else u.one)
 
 
+def _isolated(table, limit):
+    """Which detections (n,) no neighbour disturbs, as `is_isolated`; how many others there are is logged."""
+    isolated = is_isolated(table, limit)
+    if not isolated.all():
+        why = "" if "crowding" in table.colnames else " (flagged as blended in their lists; --isolation inf keeps them)"
+        log.info("%d of %d detections are not isolated and left out%s", np.count_nonzero(~isolated), len(table), why)
+    return isolated
+
+
 def _without_flagged(table, reject_flags):
     """The table without rows of which a flag is to be rejected; a missing flag is none."""
     if "flags" not in table.colnames:
         return table
     flags = np.nan_to_num(np.clip(table["flags"], 0, LARGEST_FLAGS)).astype(int)
     good = (flags & reject_flags) == 0
+    counts = {flag.name: np.count_nonzero(flags & flag) for flag in Flag if flag & reject_flags}
+    named = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+    if not good.all() and "crowding" not in table.colnames:  # what measure flags is in its own table
+        n = np.count_nonzero(~good)
+        log.info("%d of %d detections are left out for their flags (%s)", n, len(table), named)
     if not good.any():
-        counts = {flag.name: np.count_nonzero(flags & flag) for flag in Flag if flag & reject_flags}
-        named = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
         raise MatchError(
             f"none of the {len(table)} detections can be used, all have flags for which they are rejected ({named}): "
             "correct the column flags or leave it out, or give the bits to reject, match(reject_flags=...), 0 for none"

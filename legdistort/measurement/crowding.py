@@ -24,6 +24,9 @@ DEFORMED = 4.0
 #: Signal-to-noise ratio of stars that determine what shape is usual.
 SHAPELY = 20
 
+#: Part of the detections of another program that must have no neighbours for those that have some to be left out.
+CLEAN = 0.5
+
 #: FWHM: two stars nearer than that are one, where neighbours are fitted together.
 SAME = 0.2
 
@@ -44,7 +47,8 @@ def check_isolation(limit):
 def is_isolated(table, limit=LIMIT):
     """Whether detections have neither `crowding` above a limit nor the flag ``DEFORMED``.
 
-    Tables without a column ``crowding``, of other programs, do not have it: all their rows pass.
+    Of tables without a column ``crowding``, of other programs, those pass that have no flag ``BLENDED`` either, if that
+    is most of them (`CLEAN`), else all.
 
     Parameters
     ----------
@@ -63,12 +67,21 @@ def is_isolated(table, limit=LIMIT):
         If the limit is not positive.
     """
     check_isolation(limit)
-    if limit is None or limit == np.inf or "crowding" not in table.colnames:
-        return np.ones(len(table), dtype=bool)
+    isolated = np.ones(len(table), dtype=bool)
+    if limit is None or limit == np.inf or not {"crowding", "flags"} & set(table.colnames):
+        return isolated
+    if "crowding" not in table.colnames:  # how far a neighbour pulls is not known
+        clean = (_flags(table) & Flag.BLENDED) == 0
+        return clean if np.count_nonzero(clean) >= CLEAN * len(table) else isolated
     isolated = np.asarray(table["crowding"], dtype=float) <= limit
     if "flags" in table.colnames:
         isolated &= (np.asarray(table["flags"]).astype(int) & Flag.DEFORMED) == 0
     return isolated
+
+
+def _flags(table):
+    """Flags (n,) of a table of another program; a missing one is none."""
+    return np.nan_to_num(np.clip(np.ma.filled(table["flags"], 0), 0, 2**31)).astype(int)
 
 
 def displacement(xy, flux, fwhm, *, sources=None):

@@ -274,7 +274,10 @@ def _read_header_text(text, ext, name):
     """One header, or several as SCAMP writes them."""
     headers = headers_of(text)
     if ext is None and len(headers) > 1:
-        raise InputError(f"{name} holds {len(headers)} headers: choose one with ext (--ext) 0 ... {len(headers) - 1}")
+        raise InputError(
+            f"{name} holds {len(headers)} headers: choose one with ext (--ext) 0 ... {len(headers) - 1}; of several "
+            f"detectors legdistort camera FRAME --headers {name} --out camera.asdf takes all, for --camera"
+        )
     if not str(ext or 0).isdigit() or int(ext or 0) >= len(headers):
         raise InputError(f"{name}: no header {ext!r}; it has {len(headers)}, counted from 0")
     return _from_header(headers[int(ext or 0)], name if len(headers) == 1 else f"{name}[{ext}]")

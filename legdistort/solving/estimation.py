@@ -30,7 +30,7 @@ from ..runtime.words import UNSTATED
 from . import agreement, minimisers, model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought, common_widths, held, with_declared_size
-from .checks.limits import ALIKE, MOST_NAMED, UNDETERMINED
+from .checks.limits import ALIKE, MOST_NAMED, UNDETERMINED, of_chi2
 from .choices import prior_widths
 from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, validation
@@ -586,11 +586,13 @@ def _tell_lost_stars(fit):
         named.append(f"{fit.matches.stars[j]} ({some_of([fit.problem.names[i] for i in seen], MOST_NAMED)})")
     more = f" and {len(lost) - len(named)} more" * (len(lost) > len(named))
     orbits = "stars on orbits stay with terms=['orbits'] (--term orbits); " * bool(fit.problem.terms.n)
+    too_large = fit.dof > 0 and fit.chi2 > of_chi2(fit.dof)[1] * fit.dof  # else no floor is found
+    floor = "; bright ones may have errors that are too small: errors='floor' (--errors floor)" if too_large else ""
     warn(
         f"{len(lost)} star{'s have' if len(lost) > 1 else ' has'} no position, the observations contradict one another "
         f"and there is no majority: {', '.join(named)}{more}; if a check names what displaces stars (motions, static "
         f"distortions, a layout), see to that first; {orbits}else look whether they are matched rightly, or leave them "
-        "out; bright ones may have errors that are too small: errors='floor' (--errors floor)",
+        f"out{floor}",
         AssumptionWarning,
     )
 

@@ -173,7 +173,7 @@ class ReferenceTie:
         may_be_bent = self.identified.maps is None and not (self.finds_errors or problem.terms.n)
         if not may_be_bent or bent_reference.is_as_stated(made, agrees):
             return agrees
-        cure = bent_reference.cure(stated, self._estimate, result, self.identified, self.degree)
+        cure = bent_reference.cure(stated, self._estimate, result, self.identified, self.degree, problem.degree)
         return replace(agrees, **cure)
 
     def hold_stars(self, problem, result, prior):

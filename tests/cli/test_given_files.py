@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.table import QTable
 from night_sets import SIZE, Nights
 from scamp_heads import barrel, matrix, write_head
@@ -143,3 +144,36 @@ def test_the_shape_of_a_header_comes_from_what_it_is_used_with(table, tmp_path, 
         assert "give --shape NY NX; legdistort prior has that option, and what it writes can be given here" in told
     assert main(["predict", "--prior", str(head), "--n-exposures", "4", "--n-stars", "30", "--sigma", "0.02"]) == 1
     assert capsys.readouterr().err.endswith("give --shape NY NX\n")
+
+
+@pytest.fixture
+def mosaic(tmp_path):
+    """A frame of two detectors of 60 x 50 pixels, and the text of other headers, as SCAMP writes it."""
+    frame, blocks = [fits.PrimaryHDU()], []
+    for k in (1, 2):
+        cards = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 150.0, "CRVAL2": 2.0, "CRPIX1": 130.0 - 65 * k,
+                 "CRPIX2": 25.0, "CD1_1": -1e-4, "CD1_2": 0.0, "CD2_1": 0.0, "CD2_2": 1e-4}  # fmt: skip
+        frame.append(fits.ImageHDU(np.random.default_rng(k).normal(size=(50, 60)), name=f"CCD{k}"))
+        frame[-1].header.update(cards | {"CCDNAME": f"ccd-{k}"})
+        scaled = fits.Header((cards | {"CD1_1": -1.01e-4, "CD2_2": 1.01e-4, "CRPIX1": 130.0 - 75 * k}).items())
+        blocks.append("\n".join([*map(str, scaled.cards), "END     "]))
+    fits.HDUList(frame).writeto(tmp_path / "m.fits")
+    (tmp_path / "m.head").write_text("\n".join(blocks) + "\n")
+    return tmp_path / "m.fits", tmp_path / "m.head"
+
+
+def test_a_camera_by_the_headers_of_a_frame(mosaic, tmp_path, capsys):
+    frame, text = map(str, mosaic)
+    far = {}
+    for out, more in (("own", []), ("scamp", ["--headers", text])):
+        assert main(["camera", frame, *more, "--out", str(tmp_path / f"{out}.asdf")]) == 0
+        camera = ld.Camera.read(tmp_path / f"{out}.asdf")
+        assert list(camera.detectors) == ["CCD1", "CCD2"]
+        far[out] = abs(np.diff([camera[key].layout[0, 2] for key in camera.detectors])[0])
+    assert far == pytest.approx({"own": 65.0, "scamp": 75.0}, abs=1e-3)
+    assert main(["prior", text, "--shape", "50", "60", "--out", str(tmp_path / "p.asdf")]) == 1
+    assert f"legdistort camera FRAME --headers {text} --out camera.asdf takes all" in capsys.readouterr().err
+    assert main(["camera", frame, "--ext", "CCD1", "--headers", text, "--out", str(tmp_path / "o.asdf")]) == 1
+    assert "m.head has 2 headers" in capsys.readouterr().err
+    assert main(["camera", frame, "--ext", "CCD1", "--out", str(tmp_path / "o.asdf")]) == 1
+    assert "has one image: legdistort prior" in capsys.readouterr().err

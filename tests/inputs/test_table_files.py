@@ -19,9 +19,10 @@ import legdistort
 from legdistort.cli import parser
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortError
 from legdistort.inputs import column_contract
+from legdistort.inputs.exposures import Exposure
 from legdistort.inputs.star_lists import sextractor
 from legdistort.inputs.star_lists.formats import stack
-from legdistort.inputs.table_files import read_table, write_stars
+from legdistort.inputs.table_files import named_after, read_table, write_stars
 from legdistort.matching.matches import Matches
 from legdistort.measurement.positions import Flag
 from legdistort.priors.prior import Prior
@@ -56,13 +57,16 @@ def sextractor_table(tmp_path):
     return Table.read(tmp_path / "list.cat", format="ascii.sextractor")
 
 
-def write_ldac(path, *tables, size=(700, 600)):
-    """FITS_LDAC as SExtractor writes it: the header of the image as text before every table."""
-    header = fits.Header([("SIMPLE", True), ("BITPIX", -32), ("NAXIS", 2), ("NAXIS1", size[0]), ("NAXIS2", size[1])])
-    text = header.tostring(endcard=True, padding=False)
-    cards = np.array([[text[k : k + 80] for k in range(0, len(text), 80)]], dtype="S80")
+def write_ldac(path, *tables, size=(700, 600), images=None):
+    """FITS_LDAC as SExtractor writes it: the header of the image as text before every table, with cards of `images`."""
     hdus = [fits.PrimaryHDU()]
-    for table in tables:
+    for table, image in zip(tables, images or [{}] * len(tables), strict=True):
+        header = fits.Header(
+            [("SIMPLE", True), ("BITPIX", -32), ("NAXIS", 2), ("NAXIS1", size[0]), ("NAXIS2", size[1])]
+        )
+        header.extend(image.items())
+        text = header.tostring(endcard=True, padding=False)
+        cards = np.array([[text[k : k + 80] for k in range(0, len(text), 80)]], dtype="S80")
         card = fits.Column("Field Header Card", f"{len(text)}A", array=cards, dim=f"(80, {len(text) // 80})")
         hdus += [
             fits.BinTableHDU.from_columns([card], name="LDAC_IMHEAD"),
@@ -107,6 +111,75 @@ def test_ldac_of_several_extensions_is_several_exposures(tmp_path):
     assert_detections(out[:3], "m_1")
     assert set(out["exposure"][3:]) == {"m_2"}
     assert out.meta["shapes"] == {"m_1": [600, 700], "m_2": [600, 700]}
+
+
+#: What SExtractor 2.25.0 copies of the headers of a mosaic whose extensions are CCD1 and CCD2.
+MOSAIC = [{"EXTNAME": f"CCD{k}", "CCDNAME": f"ccd-{k}", "CCDNUM": k} for k in (1, 2)]
+
+
+def test_ldac_of_a_mosaic_is_one_exposure_of_several_detectors(tmp_path, caplog):
+    """As the extensions of its frame: their names differ by a number, and a keyword tells them to be detectors."""
+    table = sextractor_table(tmp_path)
+    with caplog.at_level("INFO", logger="legdistort"):
+        out = read_table(write_ldac(tmp_path / "m.ldac", table, table[:2], images=MOSAIC))
+    assert set(out["exposure"]) == {"m"}
+    assert out["detector"].tolist() == ["CCD1"] * 3 + ["CCD2"] * 2
+    assert out.meta["shapes"] == {"m-CCD1": [600, 700], "m-CCD2": [600, 700]}
+    assert "2 tables CCD1 to CCD2 of a list are taken for the detectors of one camera, by CCDNAME" in caplog.text
+    chips = [{"EXTNAME": "SCI", "EXTVER": k, "CCDCHIP": 3 - k} for k in (1, 2)]
+    out = read_table(write_ldac(tmp_path / "h.ldac", table, table[:2], images=chips))
+    assert out["detector"].tolist() == ["2"] * 3 + ["1"] * 2
+    out.write(tmp_path / "h.ecsv")  # what stays of the headers can be written
+    images = [{"EXTNAME": name, "CCDNAME": name} for name in ("SCI", "ERR")]
+    out = read_table(write_ldac(tmp_path / "e.ldac", table, table[:2], images=images))
+    assert set(out["exposure"]) == {"e_1", "e_2"}
+    assert "detector" not in out.colnames
+
+
+def mosaic_frames(ids, name="m"):
+    return [Exposure(f"{name}-{key}", np.ones((600, 700)), exposure=name, detector=key) for key in ids]
+
+
+def test_tables_of_a_mosaic_have_the_detectors_of_its_frames(tmp_path, caplog):
+    table = sextractor_table(tmp_path)
+    path = write_ldac(tmp_path / "m.ldac", table, table[:2], images=MOSAIC)
+    for ids in (["ccd-2", "ccd-1"], ["CCD2", "CCD1"]):  # by whichever keyword, in whichever order
+        out = named_after(read_table(path), mosaic_frames(ids), path)
+        assert out["detector"].tolist() == [ids[1]] * 3 + [ids[0]] * 2
+        assert set(out["exposure"]) == {"m"}
+    with caplog.at_level("INFO", logger="legdistort"):
+        out = named_after(read_table(path), mosaic_frames(["north", "south"]), path)
+    assert out["detector"].tolist() == ["north"] * 3 + ["south"] * 2
+    assert "tables of a list are taken for the detectors north, south in this order" in caplog.text
+    bare = write_ldac(tmp_path / "bare.ldac", table, table[:2])  # of headers that name nothing
+    out = named_after(read_table(bare), mosaic_frames(["a", "b"], "bare"), bare)
+    assert out["detector"].tolist() == ["a"] * 3 + ["b"] * 2
+    assert out.meta["shapes"] == {"bare-a": [600, 700], "bare-b": [600, 700]}
+    with pytest.raises(InputError, match=r"m\.ldac: which detectors of m \(a, b, c\) its 2 tables are"):
+        named_after(read_table(path), mosaic_frames("abc"), path)
+
+
+def test_lists_of_a_mosaic_are_matched_without_frames(tmp_path, capsys):
+    """Two detectors side by side in dithered exposures: 5 exposures, of the dates of the headers, not 10."""
+    rng, paths = np.random.default_rng(3), []
+    stars = rng.uniform((-200, -150), (1600, 750), (400, 2))
+    for n, shift in enumerate(rng.uniform(-140, 140, (5, 2))):
+        tables = []
+        for k in (0, 1):
+            xy = stars + shift - [[k * 720, 0]] + rng.normal(0, 0.02, stars.shape)
+            xy = xy[np.all((xy > 0) & (xy < (699, 599)), axis=1)] + 1
+            tables.append(Table({"XWIN_IMAGE": xy[:, 0], "YWIN_IMAGE": xy[:, 1]}))
+            tables[-1]["ERRX2WIN_IMAGE"], tables[-1]["ERRY2WIN_IMAGE"], tables[-1]["ERRXYWIN_IMAGE"] = 4e-4, 4e-4, 0.0
+        images = [image | {"DATE-OBS": f"2026-11-2{n}T03:00:00"} for image in MOSAIC]
+        paths.append(str(write_ldac(tmp_path / f"d{n}.ldac", *tables, images=images)))
+    assert parser.main(["match", *paths, "--out", str(tmp_path / "m.ecsv")]) == 0
+    said = capsys.readouterr()
+    assert "stars in 5 exposures" in said.out
+    assert "dates of the lists are those of the headers of their images (LDAC_IMHEAD)" in said.err
+    assert "10 exposures" not in said.err
+    found = Table.read(tmp_path / "m.ecsv")
+    assert set(found["detector"]) == {"CCD1", "CCD2"}
+    assert_allclose(np.ptp(found["epoch"]), 4 / 365.25, rtol=1e-4)
 
 
 def test_sextractor_in_a_plain_fits_table(tmp_path):

@@ -390,7 +390,7 @@ def test_where_all_are_flagged_the_flags_are_named():
         match=r"none of the 80 detections .*\(SATURATED 40, EDGE 40\): correct the column.*reject_flags",
     ):
         match(table, shape=(2048, 2048))
-    assert len(match(table, shape=(2048, 2048), reject_flags=0).stars) == 20
+    assert len(match(table, shape=(2048, 2048), reject_flags=0, isolation=None).stars) == 20
     table["flags"] = np.where(table["exposure"] == table["exposure"][0], 1.0, np.nan)  # no flag is none
     matches = match(table, shape=(2048, 2048), min_exposures=3)
     assert matches.left_out == {table["exposure"][0]: "only 0 usable detections of at least 5"}

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from ao_images import apart, identify
+from astropy import units as u
 from astropy.stats import biweight_scale
 from astropy.table import QTable
 from scipy.spatial import cKDTree
@@ -230,9 +231,36 @@ def test_limit():
     np.testing.assert_array_equal(is_isolated(table, 6.0), [True, False, True, False])
     for everything in (None, np.inf):
         assert is_isolated(table, everything).all()
-    assert is_isolated(table["flags",]).all()  # tables of other programs
+    assert is_isolated(table["flags",]).all()  # tables of other programs know of blends alone
     with pytest.raises(InputError, match="isolation must be a positive number of standard errors, or None, got 0"):
         is_isolated(table, 0)
+
+
+def test_blends_of_other_programs_are_left_out_where_most_rows_are_none():
+    """As SExtractor has FLAGS 1 to 3; of a table of blends no star would be left."""
+    table = QTable({"flags": np.ma.array([0, 32, 0, 64, 33], mask=[False, False, True, False, False])})
+    np.testing.assert_array_equal(is_isolated(table), [True, False, True, True, False])
+    assert is_isolated(table, None).all()
+    assert is_isolated(QTable({"flags": [32, 32, 0]})).all()
+
+
+def test_match_says_what_it_leaves_out_of_lists(caplog):
+    """Blended rows displaced, as windowed positions are: every star but these stays, and numbers are said."""
+    table = ld.simulate_matches(n_stars=40, n_exposures=5, dither=50, seed=1).matches.table
+    table.remove_column("star")
+    table["flags"] = 0
+    table["flags"][::10] = 32
+    table["flags"][5::40] = 1
+    table["x"][::10] += 0.3 * u.pix
+    n = len(table)
+    with caplog.at_level("INFO", logger="legdistort"):
+        kept = ld.match(table, shape=(2048, 2048)).table
+    assert not np.any(kept["flags"])
+    assert f"{len(range(5, n, 40))} of {n} detections are left out for their flags (SATURATED" in caplog.text
+    assert (
+        "are not isolated and left out (flagged as blended in their lists; --isolation inf keeps them)" in caplog.text
+    )
+    assert np.any(ld.match(table, shape=(2048, 2048), isolation=None).table["flags"] == 32)
 
 
 def test_match_leaves_out_what_is_not_isolated():

@@ -3,6 +3,7 @@
 import itertools
 import re
 import warnings
+from types import SimpleNamespace
 
 import dense_model
 import drawn_sets
@@ -14,6 +15,8 @@ import pytest
 
 import legdistort as ld
 from legdistort.exceptions import LegdistortWarning
+from legdistort.results.check import Check
+from legdistort.solving.checks.cures import with_cost
 
 
 def solved(data, **options):
@@ -164,3 +167,16 @@ def test_of_three_cures_of_a_camera_the_right_one_is_named():
 )
 def test_of_three_cures_of_a_camera_the_right_one_is_named_in_other_sets(kind, seed):
     assert_camera_is_cured(kind, seed)
+
+
+@pytest.mark.parametrize(("ratio", "told"), [(1.22, True), (2.0, False)])
+def test_what_a_higher_degree_costs_is_said_where_it_gains_little(ratio, told):
+    made = {
+        "chi2": Check("chi2", "warn", ratio, 1.1, "chi2/dof", "--degree 4 would bring chi2/dof to 1.00"),
+        "brightness": Check("brightness", "warn", 1.2, None, "the brightest third", "--errors floor"),
+        "degree": Check("degree", "pass", 0.0, None, "degree 4 would explain nothing more"),
+    }
+    after = with_cost(made, SimpleNamespace(chi2=1000 * ratio, dof=1000))
+    assert ("errors of positions grow" in after["chi2"].sentence) is told
+    assert {name: after[name] for name in ("brightness", "degree")} == {n: made[n] for n in ("brightness", "degree")}
+    assert after["chi2"].cure == made["chi2"].cure

@@ -3,7 +3,6 @@
 import io
 from pathlib import Path
 
-import numpy as np
 from astropy.io import fits
 from astropy.table import Table, vstack
 
@@ -12,7 +11,7 @@ from ...runtime import checks
 from ...runtime.fits_bytes import open_fits, unpacked
 from ...runtime.guards.offline import offline
 from ..plain_columns import from_fits
-from . import text_lists
+from . import list_images, text_lists
 
 
 def read(path):
@@ -26,8 +25,8 @@ def read(path):
     -------
     list of `~astropy.table.Table`
         One, or as many as an LDAC file has detections of images. ``meta`` has only what is understood: ``inputs``, and
-        what `legdistort.matching.matches.Matches.to_meta` writes; ``shape`` of the image; ``program``, "hst1pass" or
-        "DAOPHOT", where the columns do not show it.
+        what `legdistort.matching.matches.Matches.to_meta` writes; ``image``, what its header states (`list_images`);
+        ``program``, "hst1pass" or "DAOPHOT", where the columns do not show it.
 
     Raises
     ------
@@ -87,14 +86,10 @@ def _read_fits(content):
 
 
 def _table_of(hdus, k):
-    """One table with the shape of its image, if the header of that stands before it (LDAC_IMHEAD)."""
+    """One table with what the header of its image states, if that stands before it (LDAC_IMHEAD)."""
     with without_astropy_warnings():  # of names of columns that are no words of ASCII, of units of other programs
         table = from_fits(Table.read(hdus[k]))
     table.meta = {key: value for key, value in table.meta.items() if key in ("shapes", "poses", "sky", "left_out")}
     if k and hdus[k - 1].name == "LDAC_IMHEAD":
-        cards = np.asarray(hdus[k - 1].data.field(0)).astype("S").ravel().tolist()
-        header = fits.Header.fromstring(b"".join(card.ljust(80) for card in cards))
-        size = [header.get(f"Z{key}", header.get(key)) for key in ("NAXIS2", "NAXIS1")]
-        if all(isinstance(n, int) and n > 0 for n in size):
-            table.meta["shape"] = size
+        table.meta["image"] = list_images.stated(list_images.read_header(hdus[k - 1]))
     return table

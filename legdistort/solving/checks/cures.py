@@ -31,6 +31,12 @@ _FITTED = 1e-6
 _EXACT = 1.25
 #: Numbers of the modes of a degree up to which they are fitted on trial.
 _VALUES = 30_000_000
+#: chi2/dof below which a higher degree may cost more than it gains: errors of positions grow with its coefficients.
+_MILD = 1.5
+_COST = (
+    "; a higher degree has more coefficients, with which errors of positions grow, which chi2 does not weigh: compare "
+    "the errors of both"
+)
 _WOULD = {"pass": "this check would pass", "unknown": "this check would be unknown", "warn": "this check would warn"}
 #: Checks whose value is an rms, and those that smooth fields of single exposures may be behind.
 _RMS = "place", "time", "degree"
@@ -95,6 +101,14 @@ def with_cures(checks, solution, residuals, observed, judged):
     found = observed.detector is None and not solution.settings.terms and can_be_found(observed.problem)
     concerned = [name for name in wrong if name in _BY_FIELDS]
     return checks | {name: _with_fields(checks[name], fields, own, found) for name in concerned}, explained
+
+
+def with_cost(checks, residuals):
+    """Checks of errors that name a higher degree with what it costs, where chi2 is little too large; `Residuals`."""
+    if residuals.chi2 > _MILD * residuals.dof:
+        return checks
+    named = [name for name in _OF_ERRORS if name in checks and checks[name].cure.startswith("--degree ")]
+    return checks | {name: replace(checks[name], sentence=checks[name].sentence + _COST) for name in named}
 
 
 def _with_static_degree(checks, higher):

@@ -6,7 +6,8 @@ import numpy as np
 from scipy import special
 
 from ...exceptions import some_of
-from ...results.check import FALSE_ALARM, Check, FactorTest, state_of
+from ...results.check import FALSE_ALARM, WRONG, Check, FactorTest, state_of
+from .known_effects import LAYOUT, STATICS
 from .limits import GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, as_one, of_chi2
 
 #: Degrees of freedom that tell whether the errors of a reference are right.
@@ -18,11 +19,23 @@ _OFFSETS = (
     "if it is of another year and without proper motions, --reference-error found, or errors that contain the years "
     "times a usual motion; else look at its errors and their unit, and its epoch (ref_epoch)"
 )
+#: Cures of the camera that residuals call for, and what is said of one before the others.
+_OF_DETECTORS = LAYOUT.cure, STATICS.cure
+_CALLED_FOR = "first, which the residuals call for (see camera); if the reference does not agree then"
+_STATICS = "; else --static fit, which finds the distortions of single detectors"
 _TESTED = "more of its stars, dithers by a good part of the field, a turned camera, or a prior test it"
 
 
-def reference_check(solution):
-    """Does a reference agree with the exposures? None without one."""
+def reference_check(solution, camera=None):
+    """Does a reference agree with the exposures? None without one.
+
+    Parameters
+    ----------
+    solution : Solution
+    camera : Check, optional
+        Of what was taken as exact of the detectors: residuals that say what is wrong with that say why the reference
+        does not agree, and its cure comes first.
+    """
     tie, label = solution.gauge.tie, solution.diagnostics.reference
     if tie is None or tie.agreement is None:
         return None
@@ -32,7 +45,30 @@ def reference_check(solution):
         FactorTest.of_chi2("reference: positions", source, n, made.chi2, made.dof),
         FactorTest.of_chi2("reference: map", source, n, made.bend_chi2, made.bend_dof),
     )
-    return replace(_in_words(solution, tie, label), tests=tests)
+    check = _in_words(solution, tie, label)
+    if check.state in WRONG and camera is not None and camera.state in WRONG and camera.cure in _OF_DETECTORS:
+        rest = check.cure.replace(_STATICS, "")
+        check = replace(check, cure=f"{camera.cure} {_CALLED_FOR}: {rest}")
+    return replace(check, tests=tests)
+
+
+def is_told(check):
+    """Whether the cure of a check begins with one of the camera that residuals call for."""
+    return _CALLED_FOR in check.cure
+
+
+def departure(check, tie):
+    """How many times their errors the offsets of stars of a reference are, by its check; None for no more than chance.
+
+    Of a `Tie` that took errors of the reference larger than stated, absolute errors contain that factor, and what
+    contradicts them is a bend.
+    """
+    if check is None or check.state not in WRONG or not check.tests:
+        return None
+    positions, bend = check.tests
+    far = [bend] + [positions] * (tie.factor == 1)
+    far = [each for each in far if each.dof >= 1 and each.p < FALSE_ALARM and each.chi2 > each.dof]
+    return float(np.sqrt(max(each.chi2 / each.dof for each in check.tests if each.dof >= 1))) if far else None
 
 
 def _in_words(solution, tie, label):
@@ -131,7 +167,7 @@ def _otherwise(solution):
     """What else to do where a reference and the exposures contradict each other, in words; empty for nothing."""
     camera, errors = solution.camera, solution.estimate.uncertainty.camera
     if camera.has_focal_plane and (errors is None or not errors.free[:, :, 3:].any()):
-        return "; else --static fit, which finds the distortions of single detectors"
+        return _STATICS
     if camera.has_focal_plane or solution.gauge.static not in ("exact", "uncertain"):
         return ""
     return "; else leave out the static distortion given, which is not that of these exposures"

@@ -19,12 +19,12 @@ from ...results.errors.header_pointing import CURE as POINTING_CURE
 from ...results.gauge import warning_of
 from ..terms.observed import Observed
 from .camera_check import camera_check, contradicted_layout, undetermined
-from .cures import with_cures, without_static
+from .cures import with_cost, with_cures, without_static
 from .dynamic_check import EVIDENCE, dynamic_check, nights_check, significance
 from .extrapolated_maps import extrapolation_check
 from .limits import ALIKE, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, UNDETERMINED, addition_that_shows, of_chi2
 from .prior_check import prior_check
-from .reference_check import reference_check
+from .reference_check import departure, is_told, reference_check
 from .residual_tests import Residuals
 from .star_checks import overlaps_check, stars_check
 
@@ -78,20 +78,22 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     may_be = contradicted is None and several and residuals.dof >= 1 and not has_fields
     if may_be and any(check.state in WRONG for check in made.values()):
         made, explained = with_cures(made, solution, residuals, observed, judged)
+        made = with_cost(made, residuals)
+    camera = camera_check(
+        solution,
+        residuals,
+        observed,
+        camera=uncertainty.camera,
+        contradicted=contradicted,
+        error=_star_error(residuals),
+        judged=partial(_pattern_state, residuals=residuals),
+    )
     others = (
         dynamic_check(solution, problem, blocks),
         nights_check(solution, error=_star_error(residuals)),
         prior_check(solution, problem, state, error=_star_error(residuals)),
-        reference_check(solution),
-        camera_check(
-            solution,
-            residuals,
-            observed,
-            camera=uncertainty.camera,
-            contradicted=contradicted,
-            error=_star_error(residuals),
-            judged=partial(_pattern_state, residuals=residuals),
-        ),
+        reference_check(solution, camera),
+        camera,
         overlaps_check(solution, residuals),
         extrapolation_check(solution, residuals),
         rejection_check(solution),
@@ -133,7 +135,7 @@ def _causes_first(checks, explained):
 
     def with_cause(check):
         causes = [name for name in _CAUSES.get(check.name, ()) if name in wrong]
-        if not causes or check.name not in wrong or check.name in explained:
+        if not causes or check.name not in wrong or check.name in explained or is_told(check):
             return check
         return replace(check, cure=f"see {' and '.join(causes)} first, which may be the cause; else {check.cure}")
 
@@ -337,6 +339,11 @@ def absolute_check(solution, others):
         return Check("absolute", "unknown", len(unknown), 0, sentence, cure + _by_headers(solution, unknown))
     error = solution.gauge.absolute_error
     known = f"absolute positions are known to {error:.2g} px rms per axis over the stars, their noise aside"
+    if (factor := departure(others.get("reference"), solution.gauge.tie)) is not None:
+        found = f"{known}, by errors that stars of the reference contradict: they are off by {factor:.2g} times these"
+        return Check(
+            "absolute", others["reference"].state, error * factor, error, found, "see reference, whose cure it is"
+        )
     return Check("absolute", "pass", error, None, f"{known}; they rest on {_grounds(solution.gauge, others)}")
 
 

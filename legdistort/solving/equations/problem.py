@@ -333,8 +333,8 @@ def _check_shapes(matches, priors):
     cure = "; give the prior of this detector"
     if matches.camera.has_focal_plane:
         cure = (
-            ", the focal plane of several: give their static distortions in a camera (camera=, --camera), or let them "
-            "be found: static='fit' (--static fit)"
+            ", the focal plane of several: give their static distortions in a camera (camera=, --camera; legdistort "
+            "camera FRAME makes one of headers), or let them be found: static='fit' (--static fit)"
         )
     for name, prior in zip(matches.names, priors, strict=True):
         shape = matches.shapes[name]

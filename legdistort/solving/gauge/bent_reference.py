@@ -84,7 +84,7 @@ def is_as_stated(made, agrees):
     return made.factor == 1 and not agrees.is_bent and np.mean(~made.used) <= GROSS_ERRORS
 
 
-def cure(stated, estimate, result, identified, degree):
+def cure(stated, estimate, result, identified, degree, highest):
     """The lowest degree of a map of its own, beyond `degree`, with which a reference is what it states.
 
     Parameters
@@ -96,6 +96,9 @@ def cure(stated, estimate, result, identified, degree):
     result : Result
     identified : `legdistort.matching.cross_identification.Identified`
     degree : int
+    highest : int
+        Degree of the fit, beyond which it may have none (`check_degree`); static distortions that are given may have
+        more modes.
 
     Returns
     -------
@@ -104,7 +107,7 @@ def cure(stated, estimate, result, identified, degree):
         Empty if there is none.
     """
     xy = result.state.positions.T[identified.rows]
-    for higher in range(degree + 1, basis.degree_of(result.state.coefficients.shape[2]) + 1):
+    for higher in range(degree + 1, highest + 1):
         if len(xy) < _least_number(higher):
             break
         with contextlib.suppress(InputError):
