@@ -9,11 +9,11 @@ import functools
 import numpy as np
 from astropy import units as u
 
-from ..exceptions import MatchError, SolveError, some_of
+from ..exceptions import AssumptionWarning, MatchError, SolveError, by_reason, some_of, warn
 from ..geometry import pair_agreement
 from ..geometry.star_hull import enclosed_area
 from . import start_values
-from .checks.limits import ALIKE, UNDETERMINED
+from .checks.limits import ALIKE, MOST_NAMED, UNDETERMINED, of_chi2
 
 #: Exposures that must agree before others are left out for their sake.
 FEWEST = 3
@@ -139,6 +139,42 @@ def _undetermined(matches, name):
     xy = np.column_stack([rows["x"].to_value(u.pix), rows["y"].to_value(u.pix)])
     seen = f"its {len(rows)} stars in common with others, on {enclosed_area(xy) / (nx * ny):.0%} of its frame"
     return f"{seen}, {UNDETERMINED}"
+
+
+def warn_of_lost_exposures(fit, matches):
+    """Warn of exposures left out: of each, but of those of a night that has another distortion together."""
+    new = {n: why for n, why in fit.matches.left_out.items() if n not in matches.left_out or UNDETERMINED in why}
+    for reason, names in by_reason(new).items():
+        if ALIKE in reason and len(names) > 1:
+            warn(f"{len(names)} exposures are left out ({some_of(names, MOST_NAMED)}): {reason}", AssumptionWarning)
+        else:
+            for name in names:
+                warn(f"exposure {name} is left out: {reason}", AssumptionWarning)
+
+
+def warn_of_lost_stars(fit):
+    """Warn of stars whose observations contradict one another, so that none of them is used."""
+    star, used = fit.problem.star, fit.used
+    if used.all():
+        return
+    lost = np.flatnonzero((np.bincount(star) > 0) & (np.bincount(star, used) == 0))
+    if not len(lost):
+        return
+    named = []
+    for j in lost[:MOST_NAMED]:
+        seen = fit.problem.exposure[star == j]
+        named.append(f"{fit.matches.stars[j]} ({some_of([fit.problem.names[i] for i in seen], MOST_NAMED)})")
+    more = f" and {len(lost) - len(named)} more" * (len(lost) > len(named))
+    orbits = "stars on orbits stay with terms=['orbits'] (--term orbits); " * bool(fit.problem.terms.n)
+    too_large = fit.dof > 0 and fit.chi2 > of_chi2(fit.dof)[1] * fit.dof  # else no floor is found
+    floor = "; bright ones may have errors that are too small: errors='floor' (--errors floor)" if too_large else ""
+    warn(
+        f"{len(lost)} star{'s have' if len(lost) > 1 else ' has'} no position, the observations contradict one another "
+        f"and there is no majority: {', '.join(named)}{more}; if a check names what displaces stars (motions, static "
+        f"distortions, a layout), see to that first; {orbits}else look whether they are matched rightly, or leave them "
+        f"out{floor}",
+        AssumptionWarning,
+    )
 
 
 def without_contradictions(problem, good):

@@ -14,7 +14,7 @@ import numpy as np
 from ..cameras import ties
 from ..cameras.exchanged import check_places
 from ..cameras.stated_errors import with_errors_times
-from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, SolveError, by_reason, some_of, warn
+from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, SolveError, warn
 from ..geometry import basis
 from ..matching.header_poses import header_map_by, sky_by_layout
 from ..matching.matches import Matches
@@ -30,7 +30,6 @@ from ..runtime.words import UNSTATED
 from . import agreement, minimisers, model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought, common_widths, held, with_declared_size
-from .checks.limits import ALIKE, MOST_NAMED, UNDETERMINED, of_chi2
 from .choices import prior_widths
 from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, validation
@@ -548,8 +547,8 @@ def _tell(fit, matches, *, tied):
     A reference to which it will be `tied` adds to the data.
     """
     log.info("%s; %s%s", fit.result.status, "without the reference " * (tied and fit.dof < 1), goodness(fit))
-    _tell_lost_exposures(fit, matches)
-    _tell_lost_stars(fit)
+    agreement.warn_of_lost_exposures(fit, matches)
+    agreement.warn_of_lost_stars(fit)
     fields = None if fit.tabled is None else fit.tabled.errors
     if why := known_poses.contradiction(fit.problem, fit.result.state, fit.uncertainty, fields):
         warn(why, AssumptionWarning)
@@ -559,42 +558,6 @@ def _tell(fit, matches, *, tied):
             "determined by these exposures and stay where the prior has them; dithers with rolls determine more",
             AssumptionWarning,
         )
-
-
-def _tell_lost_exposures(fit, matches):
-    """Warn of exposures left out: of each, but of those of a night that has another distortion together."""
-    new = {n: why for n, why in fit.matches.left_out.items() if n not in matches.left_out or UNDETERMINED in why}
-    for reason, names in by_reason(new).items():
-        if ALIKE in reason and len(names) > 1:
-            warn(f"{len(names)} exposures are left out ({some_of(names, MOST_NAMED)}): {reason}", AssumptionWarning)
-        else:
-            for name in names:
-                warn(f"exposure {name} is left out: {reason}", AssumptionWarning)
-
-
-def _tell_lost_stars(fit):
-    """Warn of stars whose observations contradict one another, so that none of them is used."""
-    star, used = fit.problem.star, fit.used
-    if used.all():
-        return
-    lost = np.flatnonzero((np.bincount(star) > 0) & (np.bincount(star, used) == 0))
-    if not len(lost):
-        return
-    named = []
-    for j in lost[:MOST_NAMED]:
-        seen = fit.problem.exposure[star == j]
-        named.append(f"{fit.matches.stars[j]} ({some_of([fit.problem.names[i] for i in seen], MOST_NAMED)})")
-    more = f" and {len(lost) - len(named)} more" * (len(lost) > len(named))
-    orbits = "stars on orbits stay with terms=['orbits'] (--term orbits); " * bool(fit.problem.terms.n)
-    too_large = fit.dof > 0 and fit.chi2 > of_chi2(fit.dof)[1] * fit.dof  # else no floor is found
-    floor = "; bright ones may have errors that are too small: errors='floor' (--errors floor)" if too_large else ""
-    warn(
-        f"{len(lost)} star{'s have' if len(lost) > 1 else ' has'} no position, the observations contradict one another "
-        f"and there is no majority: {', '.join(named)}{more}; if a check names what displaces stars (motions, static "
-        f"distortions, a layout), see to that first; {orbits}else look whether they are matched rightly, or leave them "
-        f"out{floor}",
-        AssumptionWarning,
-    )
 
 
 def _diagnostics(given, fit, prior, scale, **found):
