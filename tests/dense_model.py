@@ -195,12 +195,14 @@ class Model:
 
 def drawn_set(
     seed, *, n_stars=110, n=11, static=1.0, dynamic=0.4, degree=3, size=2048, dither=150.0, rolls=0.0,
-    errors=(0.005, 0.08), higher=0.0, odd=None, shifts=None, given=None, angles=None,
+    errors=(0.005, 0.08), higher=0.0, odd=None, shifts=None, given=None, angles=None, years=None, motion=0.0,
+    nightly=0.0,
 ):  # fmt: skip
     """What `Model` takes, and the truth: stars, static (2, m), departures; px/mode, errors log-uniform by star.
 
     Departures of the last exposure are `odd` px/mode; `shifts` (n, 2) are in the place of random dithers, `given`
-    (2, m) of a static that is drawn, and `angles` [deg] of equal rolls.
+    (2, m) of a static that is drawn, and `angles` [deg] of equal rolls. Stars with motions from N(0, `motion`) are
+    where they are seen at the mean of the `years` (n,) of the exposures; those of a year depart by `nightly` px/mode.
     """
     rng = np.random.default_rng(seed)
     m, other = len(orders(degree)), rows(degree)[1]
@@ -210,7 +212,14 @@ def drawn_set(
     drawn = (static * rng.normal(size=len(other)) @ other).reshape(2, m)
     given = drawn if given is None else given
     n = n if shifts is None else len(shifts)
+    years = np.full(n, 2020.0) if years is None else years
+    n = len(years)
+    motions = np.random.default_rng((seed, 1)).normal(0, motion, (n_stars, 2))
     own = (dynamic * rng.normal(size=(n, len(other))) @ other).reshape(n, 2, m)
+    if nightly:
+        of = np.unique(years, return_inverse=True)[1]
+        shared = np.random.default_rng((seed, 2)).normal(0, nightly, (of.max() + 1, len(other)))
+        own = own + (shared @ other).reshape(-1, 2, m)[of]
     if odd is not None:
         own[-1] *= odd / dynamic
     beyond = np.zeros((2, len(orders(2 * degree - 1))))
@@ -225,7 +234,7 @@ def drawn_set(
     poses = np.concatenate([turn, (middle + shift - turn.sum(axis=2) * middle)[:, :, None]], axis=2)
     seen = []
     for i, pose in enumerate(poses):
-        q = stars @ pose[:, :2].T + pose[:, 2]
+        q = (stars + (years[i] - np.mean(years)) * motions) @ pose[:, :2].T + pose[:, 2]
         b = basis(q, 2 * degree - 1, size)[0]
         xy = q + b[:, :m] @ (given + own[i]).T + b @ beyond.T
         on = np.flatnonzero(((xy > -0.5) & (xy < size - 0.5)).all(axis=1))
@@ -235,4 +244,6 @@ def drawn_set(
     use = np.bincount(star, minlength=n_stars)[star] > 1
     used, star = np.unique(star[use], return_inverse=True)
     data = {"xy": xy[use], "err": err[use], "star": star, "exposure": exposure[use], "poses": poses, "n": size}
-    return data | {"degree": degree}, {"stars": stars[used], "static": given, "dynamic": own, "beyond": beyond}
+    data |= {"degree": degree} | ({"epoch": years[data["exposure"]]} if motion else {})
+    truth = {"stars": stars[used], "static": given, "dynamic": own, "beyond": beyond}
+    return data, truth | {"motions": motions[used], "epoch": np.mean(years)}

@@ -389,7 +389,8 @@ def _as_known(held, found, *, widths):
     `widths`: exposures have those of a prior.
     """
     positions = held.state.positions.T[elimination.typical_stars(held.blocks.v)]
-    gauge = known_maps.as_in_posterior(held.gauge, found.blocks.unknowns, positions, *found.covariances())
+    known = {"held": found.known.problem.terms.is_held}
+    gauge = known_maps.as_in_posterior(held.gauge, found.blocks.unknowns, positions, *found.covariances(), **known)
     return replace(held, gauge=replace(gauge, prior=widths), higher=found.higher_covariance)
 
 

@@ -252,10 +252,8 @@ def test_a_worthless_exposure(setting, seed, solved):
     """One of 20 px, or of 200 px where beside the scatter of exposures one of 20 px is worth a hundredth of another."""
     one, first = solved(setting, seed)
     rows = np.flatnonzero(one.columns["exposure"] == 2)
-    error, rng = (
-        200.0 if setting in ("prior", "evidence", "large distortions") else 20.0,
-        np.random.default_rng((seed, 2)),
-    )
+    scatters = setting in ("prior", "evidence", "large distortions", "motions", "motions by evidence")
+    error, rng = 200.0 if scatters else 20.0, np.random.default_rng((seed, 2))
     noise = {axis: one.columns[axis][rows] + rng.normal(0, error, len(rows)) for axis in "xy"}
     wide = np.full(len(rows), error)
     more = one.added(rows, exposure=np.full(len(rows), 99), x_err=wide, y_err=wide, **noise)

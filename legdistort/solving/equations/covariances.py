@@ -316,11 +316,13 @@ class Uncertainty:
             determined = np.einsum("jaa->ja", inverse) > 0
             more = np.einsum("ajr,bjr->jab", responses, responses)
             inverse = inverse + more * (determined[:, :, None] & determined[:, None, :])
-        out = np.zeros_like(inverse)
+        out, determined = np.zeros_like(inverse), np.einsum("jaa->ja", inverse) > 0
+        whole, field = determined.all(axis=1), self._problem.field_of_stars
+        # where others move, a star that may have moved by any amount tells nothing of a common map
+        counts = whole | ~np.isin(field, field[whole])
         for part in (slice(0, 2), slice(2, 4), slice(4, 5)):
-            block = inverse[:, part, part]
-            known = (np.einsum("jaa->ja", block) > 0).all(axis=1) if block.shape[1] else slice(0)
-            out[known, part, part] = np.linalg.inv(block[known])
+            known = counts & determined[:, part].all(axis=1)
+            out[known, part, part] = np.linalg.inv(inverse[known, part, part])
         return out
 
     def _follow(self, pulls):

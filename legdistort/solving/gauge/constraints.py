@@ -84,14 +84,11 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
     hierarchy = Hierarchy(
         motion, others, dynamic, weight, night, nightly, told, group, static, maps, modes, power, drifting @ drifts.T
     )
-    poses = _pose_rows(kind, motion, error, similar, modes)
-    if len(rates):
-        carried = influence(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
-        poses = np.concatenate([poses, (rates @ drifting.transpose(0, 2, 1) @ carried).transpose(1, 0, 2)])
+    poses = _pose_rows(kind, motion, drifting @ rates.T, error, similar, modes)
     known = hierarchy.solve(kind, released)
     rows = np.concatenate([known.rows, poses])
     covariance, drift_covariance = hierarchy.covariance(known, poses, drifting @ rates.T)
-    pointed = _without_rates(hierarchy.pointed, values, drifting.shape[2], modes.n_fields) @ drifts.T
+    pointed = without_rates(hierarchy.pointed, values, drifting.shape[2], modes.n_fields) @ drifts.T
     drift = (problem.terms.names, drifting, pointed @ drift_covariance @ pointed.T, drifts, rates)
     drift = Drift(*drift, n_fields=modes.n_fields) if problem.terms.n else None
     made = Gauge(
@@ -155,7 +152,7 @@ def _changing(problem, free, m):
     return np.repeat(changes[:, None], m // problem.n_fields, axis=1).ravel()
 
 
-def _without_rates(pointed, values, q, n_fields):
+def without_rates(pointed, values, q, n_fields):
     """Takes off modes (q,) of maps that change with time the rates and mean parallax that they do to the stars, (q, q).
 
     `pointed` (2 n, 2 n) does so for a common map; `values` (n, n_stars) are the modes at the stars.
@@ -215,20 +212,26 @@ def _in_a_word(static, shared):
 
 
 def pose_rows(problem, state, blocks):
-    """Orthonormal rows (4 n_fields, n_exposures, 2 n_modes) on coefficients that hold the plane by the poses."""
+    """Orthonormal rows (4 n_fields + c, n_exposures, 2 n_modes) on coefficients that hold the plane by the poses.
+
+    And c rates at which poses would carry it with time, where nothing is known of the motions of stars.
+    """
     modes = reference_modes(problem, state)
     motion, error = _motion(problem, state.poses, modes), conditional_errors(blocks.u_data)
-    rows = _pose_rows("minimal", motion, error, _by_shape(similarity_basis, problem), modes)
+    drifting, _, rates = _drifts(problem, motion, _by_shape(dynamic_basis, problem), problem.own_degree == 0, False)
+    rows = _pose_rows("minimal", motion, drifting @ rates.T, error, _by_shape(similarity_basis, problem), modes)
     return np.linalg.qr(rows.reshape(len(rows), -1).T)[0].T.reshape(rows.shape)
 
 
-def _pose_rows(kind, motion, error, similar, modes):
-    """Rows (4 n_fields, n_exposures, 2 n) that hold the plane by the poses, mean over the exposures."""
-    if kind == "mean":
-        return similar.transpose(1, 0, 2)
-    common = modes.similar
-    weight = influence(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
-    return (common @ motion.transpose(0, 2, 1) @ weight).transpose(1, 0, 2)
+def _pose_rows(kind, motion, rates, error, similar, modes):
+    """Rows (4 n_fields + c, n_exposures, 2 n) that hold the plane by the poses, mean over the exposures.
+
+    `rates` (n_exposures, 2 n, c) are how what changes it with time, and poses carry, changes coefficients.
+    """
+    weight = influence(error, similar)[:, None, None] * (similar.mT @ similar)
+    moved = rates.mT if kind == "mean" else np.concatenate([modes.similar @ motion.mT, rates.mT], axis=1)
+    rows = moved @ weight
+    return np.concatenate([similar, rows] if kind == "mean" else [rows], axis=1).transpose(1, 0, 2)
 
 
 def own_part(problem, state, blocks):

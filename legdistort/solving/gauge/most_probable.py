@@ -120,7 +120,7 @@ class MostProbable:
 
 def is_possible(problem):
     """Whether the most probable stars, distortions and static distortions can be sought at all."""
-    if problem.unknowns.shared or problem.terms.n or problem.fixed is not None or problem.pose_width is not None:
+    if problem.unknowns.shared or problem.fixed is not None or problem.pose_width is not None:
         return False
     return problem.degree >= 2 and problem.n_exposures >= FEWEST and reduced_system.is_small(problem)
 
@@ -136,7 +136,8 @@ def counts(problem, state, shown=1.0):
         return False
     if problem.prior_sigma is not None and problem.errors_of_statics.sigma.any():
         return True  # widths draw exposures to the mean of the prior, and not to the static distortion that they show
-    n_free = problem.n_star * problem.n_stars + problem.unknowns.size - 2 * problem.n_modes * problem.n_fields
+    n_free = problem.n_star * problem.n_stars + problem.unknowns.size
+    n_free -= problem.n_star * problem.n_modes * problem.n_fields  # maps that nothing but what is known determines
     if 2 * np.count_nonzero(problem.weight[0]) - n_free < LEFT:
         return False
     known = _Known.of(problem, problem.degree)
@@ -153,7 +154,7 @@ def counts(problem, state, shown=1.0):
     own = known.others @ conditional_errors(criterion.linearise(whole, state).u_data) @ known.others.mT
     noise, chance = np.einsum("ikk->i", own), np.sqrt(2 * np.einsum("ikl,ikl->i", own, own))
     seen = squares > noise + _SEEN * chance  # an exposure that is worth little departs far for nothing
-    return bool(np.sum((squares - noise)[seen]) > limit * problem.n_exposures)
+    return bool(np.sum((squares - noise)[seen]) > limit * np.count_nonzero(seen | (noise < limit)))
 
 
 def most_probable(problem, state, *, loss="linear", sizes=None, max_steps=MAX_STEPS):
@@ -162,7 +163,7 @@ def most_probable(problem, state, *, loss="linear", sizes=None, max_steps=MAX_ST
     Parameters
     ----------
     problem : Problem
-        Without terms of the stars, and with exposures that share nothing.
+        With exposures that share nothing.
     state : State
     loss : {"linear", "huber", "cauchy"}
         Of single observations, as for `legdistort.solving.minimisers.solve_joint`.
@@ -179,6 +180,8 @@ def most_probable(problem, state, *, loss="linear", sizes=None, max_steps=MAX_ST
     SolveError
         If data and what is known do not determine the unknowns.
     """
+    if problem.night_sigma is None and 2 * problem.n_nights > problem.n_exposures:
+        problem = replace(problem, night_sigma=0.0)  # a night of one exposure is that exposure
     keep = drawn(problem.detectors, MOST // (2 * problem.n_modes))
     if sizes is None and len(keep) < problem.n_exposures:
         sizes = most_probable(*part_of(problem, state, keep), loss=loss, max_steps=max_steps).posterior.sizes
@@ -403,7 +406,17 @@ class _Known:
     @property
     def n_scatters(self):
         """Number of sizes that are scatters, by degree, of exposures and then of nights."""
-        return int(self.degrees.max()) * (1 + bool(np.isnan(self.static_width).any()))
+        return int(self.degrees.max()) * (1 + bool(self.n_nights and self._first_of_nights))
+
+    @cached_property
+    def _first_of_nights(self):
+        """Number of the first size of nights: none of theirs where maps that change with time can take their place.
+
+        Then they scatter as exposures do; nothing tells.
+        """
+        rates = (np.count_nonzero(~np.any(self.problem.terms.precision, axis=1)) + 1) // 2 * self.problem.n_fields
+        told = self.n_nights > self.group.max() + 1 + rates
+        return int(self.degrees.max()) if told and self.problem.night_sigma is None else 0
 
     @property
     def n_sizes(self):
@@ -449,7 +462,7 @@ class _Known:
         size = [np.tile(self.degrees - 1, n)]
         size += [np.full(c, k) for c, k in zip(counts[1:], (self.n_sizes - 1, self.n_scatters, 0), strict=True)]
         if self.n_nights:
-            size[2][-self.n_nights * k :] = np.tile(self.degrees - 1 + self.degrees.max(), self.n_nights)
+            size[2][-self.n_nights * k :] = np.tile(self.degrees - 1 + self._first_of_nights, self.n_nights)
         width = [self.width.ravel(), np.ones(self.n_higher), self.static_width, np.full(len(held), width)]
         size = np.where(found, np.concatenate(size), GIVEN)
         rows = sparse.block_array(parts, format="csr")
