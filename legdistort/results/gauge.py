@@ -463,7 +463,9 @@ class Gauge(ShownAsPrinted):
         tied = f"{self.tie.sentence}; " if self.tie is not None else ""
         after = f" after {self.unknown_in_words}" if self.unknown_names else ""
         aside = ", apart from the pointing" if self.tie is None and not self.poses_known else ""
-        known = f"{tied}absolute to {error:.2g} px rms per axis{after}{aside}"
+        doubt = " if the reference is right, which the exposures contradict"
+        doubt = doubt if self.tie is not None and self.tie.is_contradicted else ""
+        known = f"{tied}absolute to {error:.2g} px rms per axis{after}{aside}{doubt}"
         if after and error == 0:  # nothing of the common map is known
             known = "absolute positions are not known"
         return f"{self.kind} ({_CONVENTIONS[self.kind]}), {self.n_maps} modes of a common map; {known}"

@@ -4,6 +4,7 @@ import json
 import re
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import dense_model
 import drawn_sets
@@ -23,6 +24,7 @@ from legdistort.reporting.page import render
 from legdistort.results.check import Check, in_lines, worst
 from legdistort.simulation.pupil import PupilPSF
 from legdistort.solving.checks.residual_tests import Residuals
+from legdistort.solving.checks.solution_checks import _of_published, errors_check
 from legdistort.solving.equations.reduced_system import Direct
 
 SIGMA = 0.14
@@ -47,6 +49,15 @@ def residuals(solution):
 
 def states(solution):
     return {check.name: check.state for check in solution.checks}
+
+
+@pytest.mark.parametrize(("chi2", "state"), [(410.0, "pass"), (560.0, "warn"), (2400.0, "fail")])
+def test_chi2_is_judged_of_what_is_published(chi2, state):
+    """What holding the common map leaves in the residuals is no fault of errors, but it is in positions."""
+    solution = replace(solved(simulated().matches), chi2=chi2, dof=400.0)
+    check = _of_published(errors_check(solution, SimpleNamespace(chi2=400.0, dof=400.0)), solution)
+    assert check.state == state
+    assert ("the common map of positions and distortions is held" in check.cure) == (state != "pass")
 
 
 def design(found):

@@ -7,6 +7,7 @@ from scipy import special
 
 from ...exceptions import some_of
 from ...results.check import FALSE_ALARM, Check, FactorTest, state_of
+from ...results.errors.catalogue_tie import HARMLESS
 from .limits import GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, as_one, of_chi2
 
 #: Degrees of freedom that tell whether the errors of a reference are right.
@@ -17,6 +18,11 @@ _TIED = 0.1
 _OFFSETS = (
     "if it is of another year and without proper motions, --reference-error found, or errors that contain the years "
     "times a usual motion; else look at its errors and their unit, and its epoch (ref_epoch)"
+)
+#: What to do about a plane that has not settled.
+_NEARER = (
+    "a prior of the static distortion (--prior), from which the plane has less far to go, or more of its stars; else "
+    "leave it out"
 )
 _TESTED = "more of its stars, dithers by a good part of the field, a turned camera, or a prior test it"
 
@@ -39,7 +45,7 @@ def _in_words(solution, tie, label):
     """The check without its tests."""
     made, name = tie.agreement, f"the reference {label.name}" if label and label.name else "the reference"
     ratio = np.sqrt(made.chi2 / made.dof) if made.dof >= _FEWEST else np.nan
-    judges = (_bend,) if made.cure else (_scatter, _mismatches, _bend)
+    judges = (_unsettled, _bend) if made.cure else (_unsettled, _scatter, _mismatches, _bend)
     wrong = as_one(judge(name, tie, ratio, solution) for judge in judges)
     if wrong is not None:
         return wrong
@@ -63,6 +69,15 @@ def _error(solution):
     """Typical absolute error of a star, pixels."""
     errors = np.stack([solution.stars[f"{axis}_err_abs"].value for axis in "xy"])
     return float(np.sqrt(np.nanmedian(errors**2))) if np.isfinite(errors).any() else np.inf
+
+
+def _unsettled(name, tie, ratio, solution):
+    """Does the plane lie where it puts it?"""
+    if not tie.unsettled:
+        return None
+    state = "warn" if tie.unsettled < HARMLESS else "fail"
+    found = f"the tie to {name} has not settled: its last round moved the plane by {tie.unsettled:.2g} of its errors"
+    return Check("reference", state, tie.unsettled, HARMLESS, found, _NEARER)
 
 
 def _scatter(name, tie, ratio, solution):

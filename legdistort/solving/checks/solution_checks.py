@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from astropy import units as u
 from scipy import special
 
 from ...exceptions import reasons_of, some_of
@@ -44,6 +45,10 @@ _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degr
 _NO_DOF = "no degrees of freedom are left to judge it by"
 _PASSES = f"passes (chance, or errors right to {100 * NEGLIGIBLE:.0f} %)"
 _TELL_STATIC = "dithers by a good part of the field, or a turned camera, show it"
+_HELD_ELSEWHERE = (
+    "the common map of positions and distortions is held where the residuals contradict it: a prior of the static "
+    "distortion (--prior, with --static-sigma), from which it has less far to go, or a lower --degree"
+)
 _SAME = 0.5  # correlation of residuals beyond which two exposures are one: no systematic error is so large
 
 
@@ -78,6 +83,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     may_be = contradicted is None and several and residuals.dof >= 1 and not has_fields
     if may_be and any(check.state in WRONG for check in made.values()):
         made, explained = with_cures(made, solution, residuals, observed, judged)
+    made["chi2"] = _of_published(made["chi2"], solution)
     others = (
         dynamic_check(solution, problem, blocks),
         nights_check(solution, error=_star_error(residuals)),
@@ -189,7 +195,7 @@ def errors_check(solution, residuals):
         beside = f" beside {'that' if held == 1 else f'the {held:.0f}'} of the common map that is held" * (held >= 1)
         found = f"no degrees of freedom are left to judge the errors by{beside}"
         return Check("chi2", "unknown", None, None, found, _MORE)
-    ratio, whole = chi2 / dof, solution.chi2 / solution.dof
+    ratio, whole = chi2 / dof, solution.chi2 / solution.diagnostics.error_scale**2 / solution.dof
     low, high = of_chi2(dof)
     if found := _errors_in_force(solution):
         found += f": chi2/dof {ratio:.3g} with them, {low:.2f} to {high:.2f} {_PASSES}"
@@ -206,6 +212,15 @@ def errors_check(solution, residuals):
     if ratio < low and not solution.diagnostics.correlated:  # weights hold all errors, residuals not what is shared
         return Check("chi2", "warn", ratio, low, found, "errors are too large")
     return Check("chi2", "pass", ratio, high, found)
+
+
+def _of_published(check, solution):
+    """The check chi2 of residuals of the positions and coefficients that are published, the plane where it is."""
+    chi2, dof = solution.chi2 / solution.diagnostics.error_scale**2, solution.dof
+    if check.state != "pass" or dof < 1 or not chi2 / dof > (most := of_chi2(dof)[1]):
+        return check
+    state = "fail" if special.chdtrc(dof, chi2) < CERTAIN and chi2 / dof > 2 else "warn"
+    return replace(check, state=state, value=chi2 / dof, limit=most, cure=_HELD_ELSEWHERE)
 
 
 def exposures_check(solution, residuals):
@@ -294,12 +309,35 @@ def time_check(solution, residuals, times):
     score = residuals.of_motion(times)
     error = _star_error(residuals)
     state, little = _pattern_state(score, residuals)
+    if unit == "days" and (common := _in_common(solution, np.ptp(times), error)):
+        move = "" if state == "pass" else f", and among themselves by {score.rms:.2g} px rms"
+        return replace(common, sentence=common.sentence + move)
     if state == "pass":
         return Check("time", "pass", score.rms, None, f"stars do not move {how}{little}")
     found = f"stars move {how}, by {score.rms:.2g} px rms (typical error of a star {error:.2g} px)"
     if (shared := solution.diagnostics.correlated) and shared.along == "time":
         return Check("time", "pass", score.rms, error, f"{found}; the errors found here count that")
     return Check("time", state, score.rms, error, found, cure)
+
+
+def _in_common(solution, days, error):
+    """The check of a motion that all stars have in common by the reference, which poses take up; None for none.
+
+    `days` from the first exposure to the last, `error` the typical one of a star, pixels.
+    """
+    tie, reference = solution.gauge.tie, solution.diagnostics.reference
+    if tie is None or tie.agreement is None or not tie.agreement.rate > 0 or not tie.agreement.rate_error > 0:
+        return None
+    move = tie.agreement.rate * days / u.yr.to(u.day)
+    state = state_of(special.chdtrc(2, (tie.agreement.rate / tie.agreement.rate_error) ** 2), move > error)
+    if state == "pass" or move < np.sqrt((1 + NEGLIGIBLE) ** 2 - 1) * error:
+        return None
+    name = f"the reference {reference.name}" if reference and reference.name else "the reference"
+    found = (
+        f"stars of {name} move in common by {move:.2g} px from the first exposure to the last (typical error of a star "
+        f"{error:.2g} px), which no residual shows: WCSs of single exposures are off by as much as half of that"
+    )
+    return Check("time", state, move, error, found, "fit the motions of the stars: --motion proper")
 
 
 def degree_check(solution, residuals, *, shows_static):
@@ -336,6 +374,12 @@ def absolute_check(solution, others):
         sentence, _, cure = warning.partition("; ")
         return Check("absolute", "unknown", len(unknown), 0, sentence, cure + _by_headers(solution, unknown))
     error = solution.gauge.absolute_error
+    if "reference" in others and others["reference"].state == "fail":
+        found = (
+            f"absolute positions rest on {_grounds(solution.gauge, others)}, which fails the check of that name: the "
+            f"error of {error:.2g} px rms per axis does not hold"
+        )
+        return Check("absolute", "fail", error, None, found, "see reference first, which is the cause")
     known = f"absolute positions are known to {error:.2g} px rms per axis over the stars, their noise aside"
     return Check("absolute", "pass", error, None, f"{known}; they rest on {_grounds(solution.gauge, others)}")
 
