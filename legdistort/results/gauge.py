@@ -50,6 +50,8 @@ CURE_OF_CAMERA = (
     "match with the camera of a solution that a reference tied (match --camera RESULTS), turn the camera between "
     "exposures, or tie to a reference (--reference)"
 )
+#: ... and what of it helps where there is one already.
+_TIE, _MORE = "or tie to a reference", "or give more stars of the reference"
 
 
 @dataclass(frozen=True, eq=False)
@@ -452,6 +454,8 @@ class Gauge(ShownAsPrinted):
             return ""
         why = _STATIC[self.static][0]
         cure = "give dynamic (--dynamic)" if self.static == "open" else CURE
+        if self.tie is not None:
+            cure = cure.replace(_TIE, _MORE)
         return f"absolute positions are not known: {why} ({self.unknown_in_words} not determined); {cure}"
 
     @property
@@ -525,7 +529,10 @@ def warning_of(solution):
     """The `Gauge.warning` of a solution, with what to do about one of a camera with several detectors."""
     of_camera = solution.camera.has_focal_plane or solution.settings.dynamic == "detector"
     warning = solution.gauge.warning
-    return warning.replace(CURE, CURE_OF_CAMERA) if of_camera else warning
+    if not of_camera:
+        return warning
+    tied = CURE_OF_CAMERA.replace(f"{_TIE} (--reference)", _MORE)
+    return warning.replace(CURE, CURE_OF_CAMERA).replace(CURE.replace(_TIE, _MORE), tied)
 
 
 def in_words(names):

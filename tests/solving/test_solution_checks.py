@@ -23,6 +23,7 @@ from legdistort.exceptions import LegdistortWarning
 from legdistort.reporting.page import render
 from legdistort.results.check import Check, in_lines, worst
 from legdistort.simulation.pupil import PupilPSF
+from legdistort.solving.checks.cures import header_first
 from legdistort.solving.checks.residual_tests import Residuals
 from legdistort.solving.checks.solution_checks import _of_published, errors_check
 from legdistort.solving.equations.reduced_system import Direct
@@ -637,3 +638,18 @@ def test_exposures_that_depart_alike_or_are_poor_are_not_named():
         data["err"][rows] *= 50
         solution = ld.solve(drawn_sets.as_matches(data), degree=3, prior=ld.Prior(truth["static"]))
         assert not [t["name"] for t in solution.factors if t["name"].startswith("departure")]
+
+
+def test_the_distortion_of_headers_comes_first_where_exposures_hardly_determine_one():
+    unused = Check("header distortion", "warn", None, None, "", "--prior header takes it")
+    wrong = [Check(name, "fail", 2.0, 1.0, "", "another") for name in ("reference", "degree", "time")]
+    loose = Check("extrapolation", "warn", 2.0, 1.0, "", "another")
+    told = {check.name: check.cure for check in header_first((*wrong, loose, unused))}
+    first = {
+        name
+        for name, cure in told.items()
+        if cure == "--prior header (see header distortion and extrapolation); else another"
+    }
+    assert first == {"reference", "degree", "extrapolation"}
+    assert header_first((*wrong, unused)) == (*wrong, unused)
+    assert header_first((*wrong, loose)) == (*wrong, loose)

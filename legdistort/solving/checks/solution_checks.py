@@ -20,7 +20,7 @@ from ...results.errors.header_pointing import CURE as POINTING_CURE
 from ...results.gauge import warning_of
 from ..terms.observed import Observed
 from .camera_check import camera_check, contradicted_layout, undetermined
-from .cures import with_cures, without_static
+from .cures import header_first, with_cures, without_static
 from .dynamic_check import EVIDENCE, dynamic_check, nights_check, significance
 from .extrapolated_maps import extrapolation_check
 from .limits import ALIKE, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
@@ -115,7 +115,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     if contradicted is not None:  # of residuals that it makes nothing else is told
         wrong = {check.name for check in made if check.state in WRONG} - {"camera"}
         return tuple(replace(c, cure="see camera first, which is the cause") if c.name in wrong else c for c in made)
-    return _causes_first(made, explained)
+    return header_first(_causes_first(made, explained))
 
 
 def _by_residuals(solution, residuals, *, times):
