@@ -48,8 +48,8 @@ def with_detectors(exposures):
             n_parts = len(set(zip(whole, ids, strict=True)))
             if None not in whole and len(set(whole)) < n_parts == len(exposures):
                 log.info(
-                    "files of the detectors %s are put together: %d exposures", ", ".join(sorted(set(ids))),
-                    len(set(whole)),
+                    "files of the detectors %s are put together: %d exposure%s", ", ".join(sorted(set(ids))),
+                    len(set(whole)), "s" * (len(set(whole)) > 1),
                 )  # fmt: skip
                 return [
                     replace(exposure, exposure=name, detector=key)

@@ -402,7 +402,8 @@ class Matches(ShownAsPrinted):
     def __repr__(self) -> str:
         n_fields = int(self.fields.max(initial=0)) + 1
         of_fields = f" of {n_fields} fields" if n_fields > 1 else ""
-        counts = f"{len(self.table)} observations of {len(self.stars)} stars in {len(self.names)} exposures"
+        exposures = f"{len(self.names)} exposure{'s' * (len(self.names) != 1)}"
+        counts = f"{len(self.table)} observations of {len(self.stars)} stars in {exposures}"
         return f"<Matches: {counts}{of_fields}>"
 
     @classmethod

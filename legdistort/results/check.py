@@ -70,6 +70,8 @@ class Check(ShownAsPrinted):
         What to do about it; empty for a pass.
     tests : tuple of FactorTest
         Of what was known beforehand, where the check is of that.
+    exposures : tuple of str
+        Those whose maps it is of; empty for all.
     """
 
     name: str
@@ -79,12 +81,18 @@ class Check(ShownAsPrinted):
     sentence: str
     cure: str = ""
     tests: tuple[FactorTest, ...] = ()
+    exposures: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("value", "limit"):
             number = getattr(self, name)
             if number is not None:  # plain numbers, as files and JSON have them
                 object.__setattr__(self, name, float(number) if isfinite(number) else None)
+
+    def doubts(self, names: set[str]) -> bool:
+        """Whether maps of some of these exposures may be off: it fails, or maps are hardly determined."""
+        wrong = self.state == "fail" or (self.name == "extrapolation" and self.state in WRONG)
+        return wrong and not (self.exposures and names.isdisjoint(self.exposures))
 
     def __str__(self) -> str:
         return f"{self.state:7s} {self.name}: {self.sentence}{'; ' * bool(self.cure)}{self.cure}"

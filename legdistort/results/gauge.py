@@ -50,6 +50,8 @@ CURE_OF_CAMERA = (
     "match with the camera of a solution that a reference tied (match --camera RESULTS), turn the camera between "
     "exposures, or tie to a reference (--reference)"
 )
+#: ... and what of it helps where there is one already.
+_TIE, _MORE = "or tie to a reference", "or give more stars of the reference"
 
 
 @dataclass(frozen=True, eq=False)
@@ -452,6 +454,8 @@ class Gauge(ShownAsPrinted):
             return ""
         why = _STATIC[self.static][0]
         cure = "give dynamic (--dynamic)" if self.static == "open" else CURE
+        if self.tie is not None:
+            cure = cure.replace(_TIE, _MORE)
         return f"absolute positions are not known: {why} ({self.unknown_in_words} not determined); {cure}"
 
     @property
@@ -463,7 +467,9 @@ class Gauge(ShownAsPrinted):
         tied = f"{self.tie.sentence}; " if self.tie is not None else ""
         after = f" after {self.unknown_in_words}" if self.unknown_names else ""
         aside = ", apart from the pointing" if self.tie is None and not self.poses_known else ""
-        known = f"{tied}absolute to {error:.2g} px rms per axis{after}{aside}"
+        doubt = " if the reference is right, which the exposures contradict"
+        doubt = doubt if self.tie is not None and self.tie.is_contradicted else ""
+        known = f"{tied}absolute to {error:.2g} px rms per axis{after}{aside}{doubt}"
         if after and error == 0:  # nothing of the common map is known
             known = "absolute positions are not known"
         return f"{self.kind} ({_CONVENTIONS[self.kind]}), {self.n_maps} modes of a common map; {known}"
@@ -523,7 +529,10 @@ def warning_of(solution):
     """The `Gauge.warning` of a solution, with what to do about one of a camera with several detectors."""
     of_camera = solution.camera.has_focal_plane or solution.settings.dynamic == "detector"
     warning = solution.gauge.warning
-    return warning.replace(CURE, CURE_OF_CAMERA) if of_camera else warning
+    if not of_camera:
+        return warning
+    tied = CURE_OF_CAMERA.replace(f"{_TIE} (--reference)", _MORE)
+    return warning.replace(CURE, CURE_OF_CAMERA).replace(CURE.replace(_TIE, _MORE), tied)
 
 
 def in_words(names):

@@ -26,6 +26,7 @@ from ..results.errors.camera_errors import CameraErrors, Departure, unit_errors
 from ..results.new_positions import widened_all
 from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA
+from .equations import elimination
 from .equations.common_parts import followed, response
 from .gauge import hierarchy
 
@@ -334,21 +335,22 @@ def _confirmed(given, found):
 
 def _errors(fit, step, unknown):
     """The `CameraErrors` of a step; `unknown` (m, k) are the directions of the camera that nothing determines."""
-    good, gauge = fit.blocks.v[0] > 0, fit.result.gauge
-    plain = gauge.modes_at(fit.result.state.positions.T[good], gauge.n_modes).T
+    good, usual, gauge = fit.blocks.v[0] > 0, elimination.typical_stars(fit.blocks.v), fit.result.gauge
+    plain = gauge.modes_at(fit.result.state.positions.T).T
+    inverse = np.linalg.pinv(plain[usual])
     changes = unit_errors(step.covariance)
     stars, unknown_stars = np.zeros((len(good), 2, changes.shape[1])), np.zeros((len(good), 2, len(unknown)))
-    spread = step.spread[:, good] @ changes
-    common = np.linalg.pinv(plain) @ spread
-    stars[good] = spread.transpose(1, 0, 2)
+    spread = step.spread @ changes
+    common = inverse @ spread[:, usual]
+    stars[good] = spread[:, good].transpose(1, 0, 2)
     for group in _groups(fit) if len(unknown) else [good]:  # errors are relative to what something ties a star to
-        own = gauge.modes_at(fit.result.state.positions.T[group], gauge.n_modes).T
-        stars[group] -= np.einsum("nm,mak->nak", own @ np.linalg.pinv(own), stars[group])
+        own = np.linalg.pinv(plain[group & usual])
+        stars[group] -= np.einsum("nm,mak->nak", plain[group] @ own, stars[group & usual])
     motion = widened_all(gauge.motion, fit.problem.degree)
     coefficients = step.response @ changes + motion @ common.reshape(-1, changes.shape[1])
     if len(unknown):
-        moved = step.spread[:, good] @ unknown.T
-        moved -= plain @ (np.linalg.pinv(plain) @ moved)
+        moved = step.spread @ unknown.T
+        moved = (moved - plain @ (inverse @ moved[:, usual]))[:, good]
         unknown_stars[good] = (moved / np.sqrt(np.mean(moved**2, axis=(0, 1)))).transpose(1, 0, 2)
     return CameraErrors(step.free, changes, stars, coefficients, unknown_stars)
 
@@ -358,12 +360,12 @@ def _with_common_map(fit, step):
 
     Elsewhere it is in the departures of exposures, which can be exchanged for it.
     """
-    good, gauge = fit.blocks.v[0] > 0, fit.result.gauge
+    usual, gauge = elimination.typical_stars(fit.blocks.v), fit.result.gauge
     positions = fit.result.state.positions.T
-    inverse = np.linalg.pinv(gauge.modes_at(positions[good], gauge.n_modes).T)
+    inverse = np.linalg.pinv(gauge.modes_at(positions[usual]).T)
 
     def of_plane(changes):
-        return (inverse @ (step.spread[:, good] @ changes)).reshape(2 * gauge.n_modes, -1)
+        return (inverse @ (step.spread[:, usual] @ changes)).reshape(2 * gauge.n_modes, -1)
 
     common, weak = of_plane(unit_errors(step.covariance)), of_plane(step.weak.T)
     weak = _CLEAR * weak / np.maximum(np.sqrt(np.mean(weak**2, axis=0)), np.finfo(float).tiny)

@@ -23,6 +23,7 @@ from ..geometry.similarity import robust_similarity
 from ..matching.cross_identification import identify
 from ..results.diagnostics import UsedReference
 from ..results.errors.absolute_errors import plain_directions, variances
+from ..results.errors.catalogue_tie import HARMLESS
 from . import minimisers
 from .equations import criterion, elimination
 from .equations.covariances import Uncertainty
@@ -37,8 +38,7 @@ log = logging.getLogger(__name__)
 _ROUNDS = 10
 #: The plane is settled when it would move by less than this part of its error, rms over the stars.
 _SETTLED = 0.01
-#: Not settled, but within this part of its error: absolute errors would change by 5 % at most.
-_HARMLESS = 0.3
+_TINY = 1e-9  # pixels: an error that is none
 #: Offsets larger than expected by this factor in chi2 raise a warning.
 _LARGE = 2.0
 #: ... and this one means that stars that move were elsewhere when the reference was made.
@@ -107,7 +107,7 @@ class ReferenceTie:
         status, first = result.status, self._rough(problem, result.state)
         if first is not None:
             result = self.solve(problem, moved_by(problem, result.state, first))
-        prior, made, rest = None, None, ""
+        prior, made, rest, unsettled = None, None, "", 0.0
         for count in range(_ROUNDS):
             if count < 2:  # afterwards the plane moves too little for another
                 errors = self._errors(problem, result)
@@ -129,7 +129,7 @@ class ReferenceTie:
             elif problem.terms.n:  # what changes with time stays where it is
                 gauge = result.gauge
                 step = np.pad(step, (0, len(gauge.drift.covariance)))
-                state = _drifted(problem, replace(result, state=state), step)[1]
+                problem, state = _drifted(problem, replace(result, state=state), step)
                 result = self._kept(self.solve(problem, state, hold=True), gauge)
             else:
                 problem = centred(problem, result.gauge, step)
@@ -140,11 +140,11 @@ class ReferenceTie:
                 "its error is %.2g px: %s",
                 *(self.label, _ROUNDS, moved, error),
                 "too little to matter"
-                if moved < _HARMLESS * error
+                if moved < HARMLESS * error
                 else "absolute positions may be off by as much; look for mismatched stars, or give a prior",
             )
-            rest = ", not settled"
-        made = replace(made, moves=self.identified.maps is not None, labels=self.identified.names)
+            rest, unsettled = ", not settled", float(moved / max(error, _TINY))
+        made = replace(made, unsettled=unsettled, moves=self.identified.maps is not None, labels=self.identified.names)
         identified, made = bent_reference.straightened(self.identified, equations, made, result, self.degree)
         straight = replace(self, identified=identified)
         common, open_maps = straight._of_reference(result.gauge, prior.n_modes, result.state.positions.T)
@@ -413,7 +413,7 @@ def _drifted(problem, result, step):
     if terms.is_held:
         mean = np.zeros((terms.n, problem.n_stars)) + terms.mean
         problem = replace(problem, moving=replace(terms, mean=mean + moved[2:]))
-    return problem, State(state.stars + moved, coefficients, state.poses)
+    return centred(problem, gauge, step), State(state.stars + moved, coefficients, state.poses)
 
 
 def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):

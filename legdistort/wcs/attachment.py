@@ -172,9 +172,8 @@ def attach(
     if unknown := _unknown_sky(solution):
         log.warning("%s", unknown)
     attached = {images.views[name].name for plan in plans for name in plan.headers}
-    for check in solution.checks:
-        if check.name == "extrapolation" and check.state != "pass" and _is_of(check, attached):
-            log.warning("%s; that is so in their WCSs too", check.sentence)
+    for words in _untrusted(solution.checks, attached):
+        log.warning("%s", words)
     if alike := [f"{plan.path.name} as {v.name}" for plan in plans for v in map(images.views.get, plan.headers)
                  if _is_another_product(plan.path, v)]:  # fmt: skip
         log.warning("frames are taken for exposures whose names differ by the last word (%d): %s", len(alike),
@@ -197,12 +196,12 @@ def attach(
     return [Attachment(plan.target, *item, kind) for plan in plans for item in plan.headers.items()]
 
 
-def _is_of(check, names):
-    """Whether what a check found is of one of these exposures: named, or perhaps one of the unnamed rest."""
-    if re.search(r" and \d+ more", check.sentence):
-        return True
-    named = map(re.escape, names)
-    return any(re.search(rf"(?<!\S)({name} \(error|\({name}\))", check.sentence) for name in named)
+def _untrusted(checks, names):
+    """Why WCSs of some exposures may be off by more than their errors say, in words, a line each."""
+    bad = [check for check in checks if check.doubts(names)]
+    if failed := [check.name for check in bad if check.state == "fail"]:
+        yield f"these WCSs may be off by more than their errors say: the solution fails the checks {', '.join(failed)}"
+    yield from (f"{check.sentence}; that is so in their WCSs too" for check in bad if check.name == "extrapolation")
 
 
 def _is_another_product(path, view):

@@ -32,6 +32,8 @@ def test_from_table_keeps_rows_and_names(sim):
     assert matches.names == tuple(dict.fromkeys(given["exposure"].tolist()))
     assert_array_equal(matches.stars, np.unique(given["star"]))
     assert repr(matches) == f"<Matches: {len(given)} observations of 25 stars in 5 exposures>"
+    one = given[given["exposure"] == "exp00"]
+    assert repr(Matches.from_table(one, shape=SHAPE)).endswith("stars in 1 exposure>")
 
 
 def test_observations_are_the_plain_table(sim):

@@ -82,15 +82,17 @@ def test_attach_says_it_in_one_line(tmp_path, caplog):
 
 
 def test_a_check_is_of_the_exposures_that_it_names():
-    def is_of(sentence, *names):
-        return attachment._is_of(Check("extrapolation", "warn", 1.0, 0.5, sentence), names)
+    check = Check("extrapolation", "warn", 1.0, 0.5, "", exposures=("e6-1", "n.2"))
+    assert check.doubts({"e0", "n.2"})
+    assert not check.doubts({"e6", "1", "nx2", "e0"})
+    assert not Check("degree", "warn", 1.0, 0.5, "").doubts({"e0"})
+    assert Check("reference", "fail", 1.0, 0.5, "").doubts({"e0"})
 
-    some = "hardly determined, where few stars join it to the others: e6-1 (error up to 2 px), n.2 (error up to 1 px)"
-    assert is_of(some, "e0", "n.2")
-    assert is_of(some, "e6-1")
-    assert not is_of(some, "e6", "1", "nx2", "e0")
-    assert is_of(f"{some} and 2 more", "e0")
-    assert is_of("up to 60% of a frame lies outside its stars, where distortions are extrapolated (e6)", "e6")
+
+def test_attach_names_the_checks_that_fail():
+    told = attachment._untrusted([Check(name, "fail", 2.0, 1.0, "") for name in ("reference", "time")], {"e0"})
+    words = "these WCSs may be off by more than their errors say: the solution fails the checks reference, time"
+    assert list(told) == [words]
 
 
 @pytest.mark.parametrize(("dynamic", "whole"), [("detector", "e6"), (None, "e6-H2RG-1")])

@@ -46,6 +46,17 @@ def test_a_right_reference_is_believed_where_exposures_cannot_test_its_shape():
     )
 
 
+def test_absolute_positions_do_not_pass_on_a_reference_that_fails():
+    solution = solved(0, "bent by 1 px")
+    assert check_of(solution).state == "fail"
+    absolute = check_of(solution, "absolute")
+    assert absolute.state == "fail"
+    assert "by errors that stars of the reference contradict: they are off by" in absolute.sentence
+    assert absolute.cure == "see reference, whose cure it is"
+    assert solution.gauge.sentence.endswith("if the reference is right, which the exposures contradict")
+    assert "contradict" not in solved(0).gauge.sentence
+
+
 def test_a_right_reference_passes_where_exposures_are_as_good():
     data, truth = dense_model.drawn_set(0, rolls=30.0, dynamic=0.002)
     table = made_catalogues.catalogue(truth["stars"], 0)

@@ -381,6 +381,13 @@ def test_a_tie_that_does_not_settle_says_how_far_it_is(monkeypatch, caplog, roun
     else:
         assert f"not settled after {rounds} rounds: the last of them moved the plane by" in caplog.text
         assert words in caplog.text
+    check = next(check for check in solution.checks if check.name == "reference")
+    assert ("the tie to the reference has not settled" in check.sentence) == (words is not None)
+    if words is not None:
+        assert check.state == {3: "fail", 4: "warn"}[rounds]
+        assert check.cure.startswith("a prior of the static distortion (--prior)")
+        near = solve(sim.matches, reference=planar(sim, 40, 0.02), prior=Prior(sim.truth.static))
+        assert near.gauge.tie.unsettled < 0.5 * solution.gauge.tie.unsettled
 
 
 def test_permuted_reference_is_the_same(sim):

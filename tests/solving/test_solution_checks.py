@@ -4,6 +4,7 @@ import json
 import re
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import dense_model
 import drawn_sets
@@ -22,7 +23,9 @@ from legdistort.exceptions import LegdistortWarning
 from legdistort.reporting.page import render
 from legdistort.results.check import Check, in_lines, worst
 from legdistort.simulation.pupil import PupilPSF
+from legdistort.solving.checks.cures import header_first
 from legdistort.solving.checks.residual_tests import Residuals
+from legdistort.solving.checks.solution_checks import _of_published, errors_check
 from legdistort.solving.equations.reduced_system import Direct
 
 SIGMA = 0.14
@@ -47,6 +50,15 @@ def residuals(solution):
 
 def states(solution):
     return {check.name: check.state for check in solution.checks}
+
+
+@pytest.mark.parametrize(("chi2", "state"), [(410.0, "pass"), (560.0, "warn"), (2400.0, "fail")])
+def test_chi2_is_judged_of_what_is_published(chi2, state):
+    """What holding the common map leaves in the residuals is no fault of errors, but it is in positions."""
+    solution = replace(solved(simulated().matches), chi2=chi2, dof=400.0)
+    check = _of_published(errors_check(solution, SimpleNamespace(chi2=400.0, dof=400.0)), solution)
+    assert check.state == state
+    assert ("the common map of positions and distortions is held" in check.cure) == (state != "pass")
 
 
 def design(found):
@@ -626,3 +638,18 @@ def test_exposures_that_depart_alike_or_are_poor_are_not_named():
         data["err"][rows] *= 50
         solution = ld.solve(drawn_sets.as_matches(data), degree=3, prior=ld.Prior(truth["static"]))
         assert not [t["name"] for t in solution.factors if t["name"].startswith("departure")]
+
+
+def test_the_distortion_of_headers_comes_first_where_exposures_hardly_determine_one():
+    unused = Check("header distortion", "warn", None, None, "", "--prior header takes it")
+    wrong = [Check(name, "fail", 2.0, 1.0, "", "another") for name in ("reference", "degree", "time")]
+    loose = Check("extrapolation", "warn", 2.0, 1.0, "", "another")
+    told = {check.name: check.cure for check in header_first((*wrong, loose, unused))}
+    first = {
+        name
+        for name, cure in told.items()
+        if cure == "--prior header (see header distortion and extrapolation); else another"
+    }
+    assert first == {"reference", "degree", "extrapolation"}
+    assert header_first((*wrong, unused)) == (*wrong, unused)
+    assert header_first((*wrong, loose)) == (*wrong, loose)

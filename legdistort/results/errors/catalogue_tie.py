@@ -9,10 +9,13 @@ import numpy as np
 from scipy import special
 
 from ...runtime.trees.facts import array, number
-from ..check import FALSE_ALARM
+from ..check import CERTAIN, FALSE_ALARM
 
 if TYPE_CHECKING:
     from ...geometry.plane_modes import PlaneModes
+
+#: A plane that has not settled, but within this part of its error: absolute errors would change by 5 % at most.
+HARMLESS = 0.3
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,9 @@ class Agreement:
         Lowest degree of a map of its own with which it would agree, where it is bent; 0 for none.
     years : float
         By which its epochs would have to be later for its stars to agree; NaN where no other epoch is better.
+    rate, rate_error : float
+        How fast its stars move in common, pixels a year, the median of their proper motions, and the error per axis;
+        NaN where it has none.
     """
 
     chi2: float = field(metadata=number(minimum=0))
@@ -45,6 +51,8 @@ class Agreement:
     unseen: float = field(metadata=number(minimum=0, infinite=True))
     years: float = field(default=float("nan"), metadata=number(nan=True))
     cure: int = field(default=0, metadata=number(minimum=0))
+    rate: float = field(default=float("nan"), metadata=number(minimum=0, nan=True, unit="pix/yr"))
+    rate_error: float = field(default=float("nan"), metadata=number(minimum=0, nan=True, unit="pix/yr"))
 
     @property
     def p(self) -> float:
@@ -115,6 +123,8 @@ class Tie:
         Of the residuals of the exposures, taken by the map: what of it they determine, not the reference.
     labels : ndarray, shape (n_reference,), or None
         What the reference calls these stars, in its column of names, else "row 0" and so on.
+    unsettled : float
+        By how much the last of all rounds moved the plane, in its errors; 0 where it settled before.
     """
 
     covariance: np.ndarray = field(metadata=array("2 k", "2 k", unit="pix2", covariance=True))
@@ -134,6 +144,7 @@ class Tie:
     own: OwnMap | None = None
     freedom: float = field(default=0.0, metadata=number(minimum=0))
     labels: np.ndarray | None = field(default=None, metadata=array("n_reference", holds="names"))
+    unsettled: float = field(default=0.0, metadata=number(minimum=0))
 
     @property
     def rms(self) -> float:
@@ -158,6 +169,12 @@ class Tie:
             named = ", ".join(out[:6]) + (" ..." if len(out) > 6 else "")
             words += f"; {len(out)} rejected as mismatched: {named}"
         return words
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether the exposures contradict it beyond doubt, or its plane has not settled."""
+        bent = self.agreement is not None and (self.agreement.cure > 0 or self.agreement.p < CERTAIN)
+        return bent or self.unsettled >= HARMLESS
 
     @property
     def alone(self) -> bool:

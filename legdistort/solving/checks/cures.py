@@ -45,6 +45,8 @@ _BY_FIELDS = "chi2", "brightness", "degree"
 #: Those that a static distortion of too low a degree fails, and what they say of it.
 _BY_DEGREE = "degree", "place"
 _STATIC = "; what is missing is alike in all exposures of a detector (static)"
+#: What a static distortion that is hardly determined, or none, may be behind.
+_OF_DISTORTION = {"chi2", "brightness", "place", "degree", "reference", "overlaps", "extrapolation"}
 
 
 def with_cures(checks, solution, residuals, observed, judged):
@@ -314,3 +316,18 @@ def _other_errors(solution, residuals, observed):
     sigma = law.sigma(filled(flux, level) * level) * of_exposure[problem.exposure]
     factor = sigma / np.sqrt(variance)
     yield "by-brightness", factor * np.sqrt(np.sum(squares / factor**2) / dof) / in_force
+
+
+def header_first(checks):
+    """Checks whose cures begin with the distortion of headers, where these exposures hardly determine theirs."""
+    wrong = {check.name for check in checks if check.state in WRONG}
+    loose = [name for name in ("overlaps", "extrapolation") if name in wrong]
+    if "header distortion" not in wrong or not loose:
+        return checks
+
+    def with_header(check):
+        if check.name not in wrong & _OF_DISTORTION:
+            return check
+        return replace(check, cure=f"--prior header (see header distortion and {loose[0]}); else {check.cure}")
+
+    return tuple(map(with_header, checks))

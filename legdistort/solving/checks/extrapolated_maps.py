@@ -38,8 +38,8 @@ def extrapolation_check(solution, residuals):
     words = f"up to {share:.0%} of a frame lies outside its stars, where distortions are extrapolated ({name})"
     if share > limit:
         return Check("extrapolation", "warn", share, limit, words,
-                     "measure fainter stars (a lower --threshold), or trust the correction only within the stars"
-                     )  # fmt: skip
+                     "measure fainter stars (a lower --threshold), or trust the correction only within the stars",
+                     exposures=(name,))  # fmt: skip
     return Check("extrapolation", "pass", share, limit, words)
 
 
@@ -80,7 +80,7 @@ def _hardly_determined(solution, residuals, shares):
                  f"the {which} hardly determined over a good part of the frame, where too few stars join it to the "
                  f"others: {named}",
                  f"leave {without} out (--without {leave}), add exposures that overlap it, lower the degree, or keep "
-                 "to the part with stars (coadd --extrapolated mask)")  # fmt: skip
+                 "to the part with stars (coadd --extrapolated mask)", exposures=tuple(names))  # fmt: skip
 
 
 def _whole(solution, name):

@@ -7,6 +7,7 @@ from scipy import special
 
 from ...exceptions import some_of
 from ...results.check import FALSE_ALARM, WRONG, Check, FactorTest, state_of
+from ...results.errors.catalogue_tie import HARMLESS
 from .known_effects import LAYOUT, STATICS
 from .limits import GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, as_one, of_chi2
 
@@ -23,6 +24,11 @@ _OFFSETS = (
 _OF_DETECTORS = LAYOUT.cure, STATICS.cure
 _CALLED_FOR = "first, which the residuals call for (see camera); if the reference does not agree then"
 _STATICS = "; else --static fit, which finds the distortions of single detectors"
+#: What to do about a plane that has not settled.
+_NEARER = (
+    "a prior of the static distortion (--prior), from which the plane has less far to go, or more of its stars; else "
+    "leave it out"
+)
 _TESTED = "more of its stars, dithers by a good part of the field, a turned camera, or a prior test it"
 
 
@@ -57,13 +63,37 @@ def is_told(check):
     return _CALLED_FOR in check.cure
 
 
-def departure(check, tie):
-    """How many times their errors the offsets of stars of a reference are, by its check; None for no more than chance.
+def absolute_by_reference(check, tie, error, known):
+    """The check of absolute positions that a reference determines, where its own says that they do not hold; else None.
+
+    Parameters
+    ----------
+    check : Check or None
+        Of the reference.
+    tie : Tie or None
+    error : float
+        Of absolute positions, pixels.
+    known : str
+        The same in words.
+    """
+    if check is None or check.state not in WRONG:
+        return None
+    if (factor := _departure(check, tie)) is not None:
+        found = f"{known}, by errors that stars of the reference contradict: they are off by {factor:.2g} times these"
+        return Check("absolute", check.state, error * factor, error, found, "see reference, whose cure it is")
+    if check.state != "fail":
+        return None
+    found = f"{known}, if the reference is right, which fails the check of that name"
+    return Check("absolute", "fail", error, None, found, "see reference first, which is the cause")
+
+
+def _departure(check, tie):
+    """How many times their errors the offsets of stars of a reference are; None for no more than chance.
 
     Of a `Tie` that took errors of the reference larger than stated, absolute errors contain that factor, and what
     contradicts them is a bend.
     """
-    if check is None or check.state not in WRONG or not check.tests:
+    if not check.tests:
         return None
     positions, bend = check.tests
     far = [bend] + [positions] * (tie.factor == 1)
@@ -75,7 +105,7 @@ def _in_words(solution, tie, label):
     """The check without its tests."""
     made, name = tie.agreement, f"the reference {label.name}" if label and label.name else "the reference"
     ratio = np.sqrt(made.chi2 / made.dof) if made.dof >= _FEWEST else np.nan
-    judges = (_bend,) if made.cure else (_scatter, _mismatches, _bend)
+    judges = (_unsettled, _bend) if made.cure else (_unsettled, _scatter, _mismatches, _bend)
     wrong = as_one(judge(name, tie, ratio, solution) for judge in judges)
     if wrong is not None:
         return wrong
@@ -99,6 +129,15 @@ def _error(solution):
     """Typical absolute error of a star, pixels."""
     errors = np.stack([solution.stars[f"{axis}_err_abs"].value for axis in "xy"])
     return float(np.sqrt(np.nanmedian(errors**2))) if np.isfinite(errors).any() else np.inf
+
+
+def _unsettled(name, tie, ratio, solution):
+    """Does the plane lie where it puts it?"""
+    if not tie.unsettled:
+        return None
+    state = "warn" if tie.unsettled < HARMLESS else "fail"
+    found = f"the tie to {name} has not settled: its last round moved the plane by {tie.unsettled:.2g} of its errors"
+    return Check("reference", state, tie.unsettled, HARMLESS, found, _NEARER)
 
 
 def _scatter(name, tie, ratio, solution):

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from astropy import units as u
 from scipy import special
 
 from ...exceptions import reasons_of, some_of
@@ -19,12 +20,12 @@ from ...results.errors.header_pointing import CURE as POINTING_CURE
 from ...results.gauge import warning_of
 from ..terms.observed import Observed
 from .camera_check import camera_check, contradicted_layout, undetermined
-from .cures import with_cost, with_cures, without_static
+from .cures import header_first, with_cost, with_cures, without_static
 from .dynamic_check import EVIDENCE, dynamic_check, nights_check, significance
 from .extrapolated_maps import extrapolation_check
 from .limits import ALIKE, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, UNDETERMINED, addition_that_shows, of_chi2
 from .prior_check import prior_check
-from .reference_check import departure, is_told, reference_check
+from .reference_check import absolute_by_reference, is_told, reference_check
 from .residual_tests import Residuals
 from .star_checks import overlaps_check, stars_check
 
@@ -44,6 +45,10 @@ _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degr
 _NO_DOF = "no degrees of freedom are left to judge it by"
 _PASSES = f"passes (chance, or errors right to {100 * NEGLIGIBLE:.0f} %)"
 _TELL_STATIC = "dithers by a good part of the field, or a turned camera, show it"
+_HELD_ELSEWHERE = (
+    "the common map of positions and distortions is held where the residuals contradict it: a prior of the static "
+    "distortion (--prior, with --static-sigma), from which it has less far to go, or a lower --degree"
+)
 _SAME = 0.5  # correlation of residuals beyond which two exposures are one: no systematic error is so large
 
 
@@ -79,6 +84,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     if may_be and any(check.state in WRONG for check in made.values()):
         made, explained = with_cures(made, solution, residuals, observed, judged)
         made = with_cost(made, residuals)
+    made["chi2"] = _of_published(made["chi2"], solution)
     camera = camera_check(
         solution,
         residuals,
@@ -111,7 +117,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     if contradicted is not None:  # of residuals that it makes nothing else is told
         wrong = {check.name for check in made if check.state in WRONG} - {"camera"}
         return tuple(replace(c, cure="see camera first, which is the cause") if c.name in wrong else c for c in made)
-    return _causes_first(made, explained)
+    return header_first(_causes_first(made, explained))
 
 
 def _by_residuals(solution, residuals, *, times):
@@ -191,7 +197,7 @@ def errors_check(solution, residuals):
         beside = f" beside {'that' if held == 1 else f'the {held:.0f}'} of the common map that is held" * (held >= 1)
         found = f"no degrees of freedom are left to judge the errors by{beside}"
         return Check("chi2", "unknown", None, None, found, _MORE)
-    ratio, whole = chi2 / dof, solution.chi2 / solution.dof
+    ratio, whole = chi2 / dof, solution.chi2 / solution.diagnostics.error_scale**2 / solution.dof
     low, high = of_chi2(dof)
     if found := _errors_in_force(solution):
         found += f": chi2/dof {ratio:.3g} with them, {low:.2f} to {high:.2f} {_PASSES}"
@@ -208,6 +214,15 @@ def errors_check(solution, residuals):
     if ratio < low and not solution.diagnostics.correlated:  # weights hold all errors, residuals not what is shared
         return Check("chi2", "warn", ratio, low, found, "errors are too large")
     return Check("chi2", "pass", ratio, high, found)
+
+
+def _of_published(check, solution):
+    """The check chi2 of residuals of the positions and coefficients that are published, the plane where it is."""
+    chi2, dof = solution.chi2 / solution.diagnostics.error_scale**2, solution.dof
+    if check.state != "pass" or dof < 1 or not chi2 / dof > (most := of_chi2(dof)[1]):
+        return check
+    state = "fail" if special.chdtrc(dof, chi2) < CERTAIN and chi2 / dof > 2 else "warn"
+    return replace(check, state=state, value=chi2 / dof, limit=most, cure=_HELD_ELSEWHERE)
 
 
 def exposures_check(solution, residuals):
@@ -296,12 +311,35 @@ def time_check(solution, residuals, times):
     score = residuals.of_motion(times)
     error = _star_error(residuals)
     state, little = _pattern_state(score, residuals)
+    if unit == "days" and (common := _in_common(solution, np.ptp(times), error)):
+        move = "" if state == "pass" else f", and among themselves by {score.rms:.2g} px rms"
+        return replace(common, sentence=common.sentence + move)
     if state == "pass":
         return Check("time", "pass", score.rms, None, f"stars do not move {how}{little}")
     found = f"stars move {how}, by {score.rms:.2g} px rms (typical error of a star {error:.2g} px)"
     if (shared := solution.diagnostics.correlated) and shared.along == "time":
         return Check("time", "pass", score.rms, error, f"{found}; the errors found here count that")
     return Check("time", state, score.rms, error, found, cure)
+
+
+def _in_common(solution, days, error):
+    """The check of a motion that all stars have in common by the reference, which poses take up; None for none.
+
+    `days` from the first exposure to the last, `error` the typical one of a star, pixels.
+    """
+    tie, reference = solution.gauge.tie, solution.diagnostics.reference
+    if tie is None or tie.agreement is None or not tie.agreement.rate > 0 or not tie.agreement.rate_error > 0:
+        return None
+    move = tie.agreement.rate * days / u.yr.to(u.day)
+    state = state_of(special.chdtrc(2, (tie.agreement.rate / tie.agreement.rate_error) ** 2), move > error)
+    if state == "pass" or move < np.sqrt((1 + NEGLIGIBLE) ** 2 - 1) * error:
+        return None
+    name = f"the reference {reference.name}" if reference and reference.name else "the reference"
+    found = (
+        f"stars of {name} move in common by {move:.2g} px from the first exposure to the last (typical error of a star "
+        f"{error:.2g} px), which no residual shows: WCSs of single exposures are off by as much as half of that"
+    )
+    return Check("time", state, move, error, found, "fit the motions of the stars: --motion proper")
 
 
 def degree_check(solution, residuals, *, shows_static):
@@ -337,13 +375,10 @@ def absolute_check(solution, others):
     if unknown:
         sentence, _, cure = warning.partition("; ")
         return Check("absolute", "unknown", len(unknown), 0, sentence, cure + _by_headers(solution, unknown))
-    error = solution.gauge.absolute_error
+    error, reference = solution.gauge.absolute_error, others.get("reference")
     known = f"absolute positions are known to {error:.2g} px rms per axis over the stars, their noise aside"
-    if (factor := departure(others.get("reference"), solution.gauge.tie)) is not None:
-        found = f"{known}, by errors that stars of the reference contradict: they are off by {factor:.2g} times these"
-        return Check(
-            "absolute", others["reference"].state, error * factor, error, found, "see reference, whose cure it is"
-        )
+    if (doubt := absolute_by_reference(reference, solution.gauge.tie, error, known)) is not None:
+        return doubt
     return Check("absolute", "pass", error, None, f"{known}; they rest on {_grounds(solution.gauge, others)}")
 
 

@@ -33,9 +33,10 @@ def overlaps_check(solution, residuals):
         return Check("overlaps", "pass", ratio, _WORSE, found)
     free = solution.settings.prior is None and solution.diagnostics.widths is None
     evidence = "--prior-sigma evidence, where exposures depart little from what they have in common; " * free
+    tied = "more stars of the reference" if solution.gauge.tie is not None else "a --reference"
     return Check("overlaps", "warn", ratio, _WORSE, f"{found}: too few of them join the exposures",
                  f"{evidence}exposures that overlap by more, fainter stars (a lower --threshold), a lower --degree, or "
-                 "a --reference")  # fmt: skip
+                 f"{tied}")  # fmt: skip
 
 
 def stars_check(solution, observed):

@@ -12,6 +12,8 @@ from .hierarchy import LIMIT
 
 #: Years by which an epoch must be another to be named.
 _OTHER_TIME = 0.1
+#: Stars whose median motion counts as the common one.
+_FEWEST = 3
 
 
 def agreement(equations, stated, used, motions=None):
@@ -40,6 +42,7 @@ def agreement(equations, stated, used, motions=None):
     moved = bends.T @ equations.metric @ (value - equations.prior.centre)
     left = at_stated.left(at_stated.solve(used)[0], used)
     chi2 = at_stated.chi2(left, used)
+    rate, rate_error = (np.nan, np.nan) if motions is None else _in_common(motions[used])
     return Agreement(
         chi2=float(chi2),
         dof=float(2 * np.count_nonzero(used) - n_maps - equations.bends.shape[2]),
@@ -48,6 +51,8 @@ def agreement(equations, stated, used, motions=None):
         bend=float(np.sqrt(np.sum(moved**2))) if n_maps == len(covariance) else np.nan,
         unseen=float(np.sqrt(addition_that_shows(dof) / shown)) if shown * LIMIT**2 > 1 else np.inf,
         years=_years(at_stated, used, left, chi2, motions),
+        rate=rate,
+        rate_error=rate_error,
     )
 
 
@@ -56,6 +61,16 @@ def _bends(equations):
     root = cholesky(equations.metric)
     similar = np.linalg.qr(root @ equations.prior.modes.similar.T)[0]
     return solve_triangular(root, complement(similar.T).T)
+
+
+def _in_common(motions):
+    """Length of the median of proper motions (n, 2), and its error per axis by their scatter; NaN of too few."""
+    known = motions[np.isfinite(motions).all(axis=1)]
+    if len(known) < _FEWEST:
+        return np.nan, np.nan
+    middle = np.median(known, axis=0)
+    scatter = np.median(np.abs(known - middle)) / special.ndtri(0.75)
+    return float(np.hypot(*middle)), float(scatter * np.sqrt(np.pi / 2 / len(known)))
 
 
 def _years(alone, used, left, chi2, motions):

@@ -58,9 +58,13 @@ def moved_by(problem, state, poses):
 
 
 def centred(problem, gauge, step):
-    """The problem with widths about a mean that is not known moved along with a map (2 n_modes,) of the plane."""
+    """The problem with widths about a mean that is not known moved along with a map of the plane.
+
+    Its modes (2 n_modes,), or (2 n_modes + q,) with those of the maps that change with time.
+    """
     if not problem.floats:
         return problem
+    motion = gauge.all_motion if len(step) > 2 * gauge.n_modes else gauge.motion
     centre = np.zeros_like(problem.prior_mean) if problem.centre is None else problem.centre.copy()
-    centre[:, :, : gauge.n_modes] -= (gauge.motion @ step).reshape(len(centre), 2, -1)
+    centre[:, :, : gauge.n_modes] -= (motion @ step).reshape(len(centre), 2, -1)
     return replace(problem, centre=centre)
