@@ -245,7 +245,7 @@ def run(
     asked = _checked_others(workers, truth, catalogue, artificial)
     reading = {"ext": ext, "dq_good": dq_good, "weight_maps": weight_maps, "camera": camera}
     paths, reading, before = _where_to_begin(paths, earlier, measuring, **reading)
-    measuring = before.measuring if before else measuring
+    how = {"measuring": before.measuring if before else measuring, **reading}
     share, timings, measured = {"workers": workers, "progress": progress}, _of_start(), {}
     with _keeping(measured, out := Path(out)), outputs.replacing_folder(out, results=RESULTS, keep=keep) as target:
         check_results(out, overwrite)  # again: nobody else writes there any more
@@ -254,9 +254,7 @@ def run(
             solving = _known_of(exposures, solving, prior, reading["camera"])
             stated_numbers({whole_name(e): e.header for e in exposures}, matching.keywords)  # refuses what none states
         with timed(timings, "measure"):
-            detections, psfs = _detected(exposures, before, measuring, share)
-        how = {"measuring": measuring, **reading}
-        measured |= {} if before else {"table": detections, "psfs": psfs, "exposures": exposures, "how": how}
+            detections, psfs = _detected(exposures, before, how, share, measured)
         with timed(timings, "match"):
             matches = match(detections, exposures=exposures, camera=reading["camera"], **vars(matching))
             matches = replace(matches, left_out=bad | matches.left_out)
@@ -265,7 +263,7 @@ def run(
             solution = provenance.with_inputs(solution, exposure_files.file_checksums(exposures))
         kept = [exposure for exposure in exposures if whole_name(exposure) in solution.names]
         stack, quality = _coadded(kept, solution, coadding, share, timings) if mosaic else (None, None)
-        joint = _catalogued(asked, kept, solution, measuring, psfs, coadding.scratch, timings, progress)
+        joint = _catalogued(asked, kept, solution, how["measuring"], psfs, coadding.scratch, timings, progress)
         comparison, stacks = _compared(compare, matches, solution, solving, quality and stack, kept, coadding, timings)
         summary = summarise(solution, timings=timings) | _counted(joint)
         summary |= _assessed(solution, kept, stack, quality, comparison, stacks, truth, joint)
@@ -567,15 +565,19 @@ def _check_exposures(exposures, min_exposures, bad, tied):
         check_enough(n_frames, min_exposures, "usable exposures" if bad else "exposures")
 
 
-def _detected(exposures, before, measuring, share):
-    """Detections and PSFs, from an earlier run or measured now; `InputError` if there is no star at all."""
-    detections, psfs = before.of(exposures) if before else measure_with_psfs(exposures, measuring, **share)
+def _detected(exposures, before, how, share, measured):
+    """Detections and PSFs, from an earlier run or measured now; `InputError` if there is no star at all.
+
+    What is measured now is put into the dict `measured`, arguments of `_keep`.
+    """
+    detections, psfs = before.of(exposures) if before else measure_with_psfs(exposures, how["measuring"], **share)
     if len(detections) == 0:
         raise InputError(
             f"no star was detected in any of the {len(exposures)} frames: look at one of them; if there are stars, "
             "lower the limit of detection (default 5), measuring={'threshold': 3} (--threshold 3), or give the width "
             "of the stars in pixels, measuring={'fwhm': ...} (--fwhm PIXELS)"
         )
+    measured |= {} if before else {"table": detections, "psfs": psfs, "exposures": exposures, "how": how}
     return detections, psfs
 
 
@@ -586,7 +588,7 @@ def _keeping(measured, out):
     Parameters
     ----------
     measured : dict
-        Filled in the block once all is measured; arguments of `_keep`.
+        Filled in the block once all is measured; arguments of `_keep` (see `_detected`).
     out : Path
         Folder of the results that are not made.
     """
