@@ -12,6 +12,7 @@ from contextvars import ContextVar
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from .assessment import baselines, run_checks, stack_quality
@@ -29,7 +30,7 @@ from .inputs.references.gaia import is_gaia
 from .matching.matcher import match
 from .matching.matches import alone
 from .matching.options import MatchOptions, check_enough
-from .measurement.earlier import EarlierRun, write_detections
+from .measurement.earlier import DETECTIONS, PSFS, EarlierRun, folder_of_measured, write_detections
 from .measurement.options import MeasureOptions
 from .measurement.positions import measure_with_psfs, write_psfs
 from .priors.prior import HEADER, HeaderPrior
@@ -71,8 +72,8 @@ RESULTS = (
     *SOLVED, "psf/*.fits", "mosaic.fits", *CATALOGUE, "report.html", "summary.json", "detections.ecsv", "matched.ecsv",
 )  # fmt: skip
 
-#: When the command began that calls, and its options for another run; None and nothing without one.
-_command: ContextVar[tuple[float | None, dict[str, Any]]] = ContextVar("_command", default=(None, {}))
+#: When the command began that calls, its options for another run, and how to call it again; without one None.
+_command: ContextVar[tuple[float | None, dict[str, Any], str | None]] = ContextVar("_command", default=(None, {}, None))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +150,8 @@ def run(
     paths : str, path, HDUList, NDData or a sequence of them
         See `legdistort.read_exposures`. By default the frames of an `earlier` run.
     out : str or path
-        Folder for the results; made if it does not exist. Nothing is left there if the run fails.
+        Folder for the results; made if it does not exist. Nothing is left there if the run fails; what it has measured
+        of files is then in the folder ``OUT.measured`` beside it, for `earlier`, and the error says so.
     earlier : str or path, optional
         Folder of an earlier run, whose measured positions are taken instead of measuring anew. All options but those of
         reading and measuring may differ, and are those of this call (the command ``run --from`` repeats those of the
@@ -243,16 +245,16 @@ def run(
     asked = _checked_others(workers, truth, catalogue, artificial)
     reading = {"ext": ext, "dq_good": dq_good, "weight_maps": weight_maps, "camera": camera}
     paths, reading, before = _where_to_begin(paths, earlier, measuring, **reading)
-    measuring = before.measuring if before else measuring
-    share, timings = {"workers": workers, "progress": progress}, _of_start()
-    with outputs.replacing_folder(out := Path(out), results=RESULTS, keep=keep) as target:
+    how = {"measuring": before.measuring if before else measuring, **reading}
+    share, timings, measured = {"workers": workers, "progress": progress}, _of_start(), {}
+    with _keeping(measured, out := Path(out)), outputs.replacing_folder(out, results=RESULTS, keep=keep) as target:
         check_results(out, overwrite)  # again: nobody else writes there any more
         with timed(timings, "read"):
             exposures, bad = _opened(paths, before, without, min_exposures, stop_at_bad, progress, reference, **reading)
             solving = _known_of(exposures, solving, prior, reading["camera"])
             stated_numbers({whole_name(e): e.header for e in exposures}, matching.keywords)  # refuses what none states
         with timed(timings, "measure"):
-            detections, psfs = _detected(exposures, before, measuring, share)
+            detections, psfs = _detected(exposures, before, how, share, measured)
         with timed(timings, "match"):
             matches = match(detections, exposures=exposures, camera=reading["camera"], **vars(matching))
             matches = replace(matches, left_out=bad | matches.left_out)
@@ -261,7 +263,7 @@ def run(
             solution = provenance.with_inputs(solution, exposure_files.file_checksums(exposures))
         kept = [exposure for exposure in exposures if whole_name(exposure) in solution.names]
         stack, quality = _coadded(kept, solution, coadding, share, timings) if mosaic else (None, None)
-        joint = _catalogued(asked, kept, solution, measuring, psfs, coadding.scratch, timings, progress)
+        joint = _catalogued(asked, kept, solution, how["measuring"], psfs, coadding.scratch, timings, progress)
         comparison, stacks = _compared(compare, matches, solution, solving, quality and stack, kept, coadding, timings)
         summary = summarise(solution, timings=timings) | _counted(joint)
         summary |= _assessed(solution, kept, stack, quality, comparison, stacks, truth, joint)
@@ -269,7 +271,7 @@ def run(
         with parallel.beside(partial(_report, target, solution, summary, shown, joint), workers=workers) as report:
             with timed(timings, "write"):
                 write_results(solution, target, psfs=psfs, mosaic=stack, joint=joint, progress=progress)
-                write_detections(target / "detections.ecsv", detections, exposures, out, measuring=measuring, **reading)
+                write_detections(target / DETECTIONS, detections, exposures, out, **how)
                 write_matched(target / "matched.ecsv", matches, solution.provenance["inputs"])
             summary = _written_summary(target, summary, timings, report)
     return Run(out, solution, stack, summary, joint)
@@ -320,7 +322,7 @@ def _written_summary(target, summary, timings, report):
     """The summary with all times, once the report is there, and what there is to check the files by; writes it."""
     with timed(timings, "report"):
         report()
-    begun, asked = _command.get()
+    begun, asked, _ = _command.get()
     summary = summary | {"timings": rounded(timings)} | ({} if begun is None else {"options": asked})
     summary |= listed_files(target)
     write_summary(target / "summary.json", summary)
@@ -328,12 +330,13 @@ def _written_summary(target, summary, timings, report):
 
 
 @contextmanager
-def called_by(begun, options):
+def called_by(begun, options, again):
     """Context in which `run` counts the time of a command since it began (`time.perf_counter`) as the step "start".
 
-    And leaves its options, ``{flag: text or None}``, in the summary, for a run that goes on from there.
+    And leaves its options, ``{flag: text or None}``, in the summary, for a run that goes on from there. `again` is the
+    command for such a run where this one fails, but for the folder that it goes on from.
     """
-    token = _command.set((begun, options))
+    token = _command.set((begun, options, again))
     try:
         yield
     finally:
@@ -342,7 +345,7 @@ def called_by(begun, options):
 
 def _of_start():
     """Seconds by step, to begin with: what the command took that calls, if it is one."""
-    since, _ = _command.get()
+    since, *_ = _command.get()
     return {} if since is None else {"start": time.perf_counter() - since}
 
 
@@ -562,16 +565,60 @@ def _check_exposures(exposures, min_exposures, bad, tied):
         check_enough(n_frames, min_exposures, "usable exposures" if bad else "exposures")
 
 
-def _detected(exposures, before, measuring, share):
-    """Detections and PSFs, from an earlier run or measured now; `InputError` if there is no star at all."""
-    detections, psfs = before.of(exposures) if before else measure_with_psfs(exposures, measuring, **share)
+def _detected(exposures, before, how, share, measured):
+    """Detections and PSFs, from an earlier run or measured now; `InputError` if there is no star at all.
+
+    What is measured now is put into the dict `measured`, arguments of `_keep`.
+    """
+    detections, psfs = before.of(exposures) if before else measure_with_psfs(exposures, how["measuring"], **share)
     if len(detections) == 0:
         raise InputError(
             f"no star was detected in any of the {len(exposures)} frames: look at one of them; if there are stars, "
             "lower the limit of detection (default 5), measuring={'threshold': 3} (--threshold 3), or give the width "
             "of the stars in pixels, measuring={'fwhm': ...} (--fwhm PIXELS)"
         )
+    measured |= {} if before else {"table": detections, "psfs": psfs, "exposures": exposures, "how": how}
     return detections, psfs
+
+
+@contextmanager
+def _keeping(measured, out):
+    """A block whose errors do not lose what it has measured, and say how to go on from there.
+
+    Parameters
+    ----------
+    measured : dict
+        Filled in the block once all is measured; arguments of `_keep` (see `_detected`).
+    out : Path
+        Folder of the results that are not made.
+    """
+    try:
+        yield
+    except BaseException as error:
+        told = _keep(out, **measured) if measured else None
+        if told and isinstance(error, LegdistortError) and len(error.args) == 1:
+            error.args = (f"{error}; {told}",)
+        elif told:
+            log.warning("%s", told)
+        raise
+
+
+def _keep(out, table, psfs, exposures, how):
+    """Leave what was measured beside the folder of results, whole or not at all; how to go on from it, or None."""
+    if any(exposure.path is None for exposure in exposures):  # which nothing could go on from
+        return None
+    begun, asked, again = _command.get()
+    place, options = folder_of_measured(out), {} if begun is None else {"options": asked}
+    try:
+        with outputs.replacing_folder(place, results=(DETECTIONS, f"{PSFS}/*.fits", provenance.SUMMARY)) as target:
+            write_psfs(psfs, target / PSFS)
+            write_detections(target / DETECTIONS, table, exposures, place, **how)
+            write_summary(target / provenance.SUMMARY, options | listed_files(target))
+    except (LegdistortError, OSError) as error:
+        log.warning("what was measured could not be kept: %s", error)
+        return None
+    call = f"{again} --from {quote(str(place))}" if again else f"run(earlier={str(place)!r}, out={str(out)!r}, ...)"
+    return f"what was measured is kept in {place}, to go on from without measuring: {call}"
 
 
 @contextmanager

@@ -31,7 +31,7 @@ from ..inputs.detector_files import of_files
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees import codec
-from ..runtime.trees.facts import SIZE, array, keyed
+from ..runtime.trees.facts import SIZE, array, keyed, number
 from . import places as found_places
 from . import static_correction, storage
 from .detector import Detector, Place
@@ -96,6 +96,9 @@ class Camera(ShownAsPrinted):
         Similarity from the plane of the `header_layout` of the detectors to the focal plane: as the layouts have it,
         but with a `common_map` scale and rotation are as the sky was found, which carries these to headers of further
         exposures. Their pointing stays.
+    header_errors : tuple of float, optional
+        Standard deviations of the scale (as a part of it) and the rotation [deg] of the `header_map` as the sky was
+        found. None: not known, or as the layouts have them.
     place_errors : array_like, shape (n_detectors, 3), optional
         Standard deviations of x, y [pix] and rotation [deg] of the `places` with the `common_map`, after one affine map
         of all detectors, with what layouts and map have in common; infinite where nothing is known. None: the errors of
@@ -135,6 +138,7 @@ class Camera(ShownAsPrinted):
     )
     common_map: np.ndarray | None = stored(default=None, metadata=array(2, "modes", unit="pix"))
     header_map: np.ndarray | None = stored(default=None, metadata=array(2, 3, unit="pix", invertible=True))
+    header_errors: tuple[float, float] | None = stored(default=None, metadata=number(minimum=0))
     place_errors: np.ndarray | None = stored(default=None, metadata=array("n_chips", 3, minimum=0, infinite=True))
     covariance: np.ndarray | None = stored(
         default=None, metadata=array("k", "k", unit="pix2", covariance=True, infinite=True)
@@ -514,14 +518,17 @@ class Camera(ShownAsPrinted):
         stated = stated_detectors(exposures) if self.has_focal_plane else {}
         layouts = {key: stated[key].header_layout if key in stated else None for key in self.detectors}
         detectors = {k: replace(each, header_layout=layouts[k]) for k, each in self.detectors.items()}
-        camera = replace(self, detectors=detectors, header_map=None)
+        camera = replace(self, detectors=detectors, header_map=None, header_errors=None)
         if not stated:
             return camera
         known = self._carried(stated) if self.states_scale else header_map(camera, stated)
-        return replace(camera, header_map=known)
+        same = self.states_scale and known is not None
+        return replace(camera, header_map=known, header_errors=self.header_errors if same else None)
 
-    def with_header_map(self, found: np.ndarray) -> Camera:
+    def with_header_map(self, found: np.ndarray, errors: tuple[float, float] | None) -> Camera:
         """The camera with scale and rotation of a `header_map` found on the sky (2, 3), the shift as layouts have it.
+
+        And with the `header_errors` of both, where these are known.
 
         That by which a sky is away from headers is the pointing of these, which is another one in the next visit.
         """
@@ -535,7 +542,7 @@ class Camera(ShownAsPrinted):
             for poses in ([each.layout for each in lie], [each.header_layout for each in lie])
         )
         turn = np.asarray(found)[:, :2]
-        return replace(self, header_map=np.column_stack([turn, here - turn @ there]))
+        return replace(self, header_map=np.column_stack([turn, here - turn @ there]), header_errors=errors)
 
     def _carried(self, stated):
         """The `header_map` for headers that have detectors otherwise turned or shifted as a whole; None for others.

@@ -37,7 +37,7 @@ from .given_files import (
     stated_camera,
     without_options_of_prior,
 )
-from .repeating import repeatable
+from .repeating import again, repeatable
 from .static_lists import given_static
 
 #: What belongs to a reference.
@@ -84,7 +84,7 @@ def do_run(a):
         given_solving(a),
     )
     own = ("psf", "degree", "prior", "clip", "min_exposures", "reference", "pixel_scale", *_TYING)
-    with pipeline.called_by(a.begun, repeatable(a)):
+    with pipeline.called_by(a.begun, repeatable(a), again(a)):
         result = legdistort.run(
             **given(a, options.RUN_FRAMES, options.FLAGGED, options.STOPPING, options.LEFT_OUT),
             out=a.out,

@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import re
+import shlex
 from pathlib import Path
 
 from ..exceptions import InputError, some_of
@@ -37,6 +38,15 @@ def repeatable(arguments):
             text = _HERE + os.path.relpath(text, arguments.out)
         found[flag] = text
     return found
+
+
+def again(arguments):
+    """The command that goes on with what a run has measured, but for ``--from``: what its folder does not repeat."""
+    words = ["legdistort", "run", "--out", str(arguments.out)]
+    for flag, text in repeatable(arguments).items():
+        words += [flag, text] if text is not None and _ASKS_A_SERVER.match(text) else []
+    words += ["--keep"] * bool(arguments.keep) + ["--overwrite"] * bool(arguments.overwrite)
+    return shlex.join(words)
 
 
 def with_earlier(arguments):

@@ -246,7 +246,7 @@ def sky_by_layout(matches, found, poses):
 
 
 def header_map_by(matches, poses, sky, variances):
-    """The `Camera.header_map` with the focal plane where a solution has it on the sky; None without the headers'.
+    """The `Camera.header_map` with the focal plane where a solution has it on the sky.
 
     The mean of the exposures by their errors: one whose pose is known badly, as it overlaps the others in a strip,
     counts by as much.
@@ -261,10 +261,19 @@ def header_map_by(matches, poses, sky, variances):
         Where that reference plane lies.
     variances : sequence of float
         Of these poses, of rotation and scale [pix^2, per axis at the corners of the focal plane].
+
+    Returns
+    -------
+    header_map : ndarray, shape (2, 3), or None
+        None without the headers' one, or without a sky.
+    weights : ndarray, shape (n_exposures,)
+        With the sum 1.
+    scatter : ndarray, shape (2,)
+        Standard deviations of scale and rotation [rad] of the mean, by how the exposures differ; zeros of a single one.
     """
     camera = matches.camera
     if camera.header_map is None or matches.sky is None or sky is None:
-        return None
+        return None, None, np.zeros(2)
     back, corners, by_header = similarity.invert(camera.header_map), _grid(camera.field, 2), []
     for name, pose in poses.items():
         places = sky.to_sky(similarity.apply(similarity.invert(pose), corners))
@@ -272,7 +281,12 @@ def header_map_by(matches, poses, sky, variances):
         by_header.append(similarity.apply(back, there))
     turned = np.array(by_header) - np.mean(by_header, axis=1, keepdims=True)
     weights = _weights(turned.reshape(len(poses), -1), np.asarray(variances))
-    return similarity.fit_similarity(np.average(by_header, axis=0, weights=weights), corners)
+    found = similarity.fit_similarity(np.average(by_header, axis=0, weights=weights), corners)
+    z, w = (turned @ [1, 1j] for turned in (turned, (corners - corners.mean(axis=0))))
+    moved = z @ w.conj() / np.vdot(w, w)  # of every exposure, scale and rotation as one number
+    off = np.stack([np.abs(moved), np.angle(moved / moved.mean())], axis=1)
+    share = 1 - np.sum(weights**2)
+    return found, weights, np.sqrt(weights**2 @ (off - weights @ off) ** 2 / share) if share > 1e-9 else np.zeros(2)
 
 
 def _weights(values, variances):
@@ -286,7 +300,9 @@ def _weights(values, variances):
     if not share > 0:
         return weights
     seen = np.mean(weights @ (values - weights @ values) ** 2)
-    return 1 / (variances + max(seen - np.sum(weights * (1 - weights) * variances), 0.0) / share)
+    scatter = max(seen - np.sum(weights * (1 - weights) * variances), 0.0) / share
+    weights = 1 / (variances + scatter)
+    return weights / weights.sum()
 
 
 def _grid(shape, n):

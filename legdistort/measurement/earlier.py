@@ -3,6 +3,7 @@
 import os
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -143,6 +144,31 @@ class EarlierRun:
         table = self.table[np.isin(self.table["exposure"], names)]
         table.meta = {}
         return table, {exposure.name: self.psfs[exposure.name] for exposure in exposures if exposure.name in self.psfs}
+
+
+def folder_of_measured(out):
+    """Where a run that fails keeps what it has measured: beside its folder, under a name that nothing else has.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the results that it could not make.
+
+    Returns
+    -------
+    Path
+        ``OUT.measured``, or with a number behind it. It may have what another such run has left, which gives way.
+    """
+    whole = out if out.name not in ("", "..") else Path(os.path.abspath(out))
+    places = (whole.with_name(f"{whole.name}.measured{f'-{n}' if n > 1 else ''}") for n in count(1))
+    return next(place for place in places if not os.path.lexists(place) or _is_unfinished(place))
+
+
+def _is_unfinished(place):
+    """Whether a folder has nothing but what a run measured that failed."""
+    files = provenance.files_of_run(place)
+    own = {provenance.SUMMARY, DETECTIONS, PSFS}
+    return files is not None and DETECTIONS in files and {path.name for path in place.iterdir()} <= own
 
 
 def _plain_options(measuring):

@@ -235,8 +235,10 @@ def sky_sentence(solution):
     pointing = None if solution.gauge.poses_known else solution.diagnostics.pointing
     if source == "from the headers" and not tied and pointing is not None and pointing.off:
         source += f" of {pointing.n_used} of {pointing.n_used + len(pointing.off)} exposures"
-    of_camera = solution.camera.name if solution.camera.states_scale else ""
-    known = pointing.error(sky.pixel_scale, of_camera) if pointing is not None and "head" in source and not tied else ""
+    camera = solution.camera
+    of_camera = (camera.name, camera.header_errors) if camera.states_scale else ()
+    told = pointing is not None and "head" in source and not tied
+    known = pointing.error(sky.pixel_scale, *of_camera) if told else ""
     source += f"; {known}" if known else ""
     words = f"tangent point {sky.lon:.6f} {sky.lat:+.6f} deg, {sky.pixel_scale:.5g} arcsec/px"
     return f"{words}{', ' * bool(source)}{source}{tied}"

@@ -21,7 +21,7 @@ from ..matching.matches import Matches
 from ..priors.prior import Prior, has_distortion
 from ..results.diagnostics import Diagnostics
 from ..results.errors.common_distortion import with_common_map
-from ..results.errors.pose_errors import pose_variances
+from ..results.errors.pose_errors import mean_pose_errors, pose_variances
 from ..results.gauge import warning_of
 from ..results.in_tables import goodness
 from ..results.settings import Settings
@@ -298,8 +298,8 @@ def _with_camera(solution, given):
     """The solution whose camera has what a reference told of its focal plane, for exposures of another field."""
     camera = with_common_map(solution.camera, solution)
     if camera.has_focal_plane and solution.gauge.n_fields == 1:
-        found = header_map_by(given, solution.poses, solution.sky, pose_variances(solution))
-        camera = camera if found is None else camera.with_header_map(found)
+        found, *mean = header_map_by(given, solution.poses, solution.sky, pose_variances(solution))
+        camera = camera if found is None else camera.with_header_map(found, mean_pose_errors(solution, *mean))
     return replace(solution, camera=camera)
 
 

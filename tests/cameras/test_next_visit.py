@@ -126,11 +126,19 @@ def test_the_next_visit_has_the_scale_and_the_rotation_of_the_first(night, first
         assert left < 0.02
         assert next(check.state for check in second.checks if check.name == "absolute") == "pass"
         assert second.camera.states_scale
+        of_scale, of_turn = second.camera.header_errors
+        assert (of_scale, of_turn) == first.camera.header_errors
+        assert abs(scale) < 3 * of_scale < 1e-4
+        assert abs(abs(turn) - abs(ROLLS[1] - ROLLS[0])) < 3 * of_turn < 5e-3
+        assert f"the error of its scale, which is {of_scale:.1g} by a reference of camera FOUR" in str(second).replace(
+            "\n        ", " "
+        )
         third = second.camera.header_map[:, :2] - first.camera.header_map[:, :2]
         assert np.abs(third).max() < 1e-5
     alone = ld.solve(matched(night, 1), prior=EVIDENCE)
     assert off_sky(night, alone)[0] == pytest.approx(SCALE, rel=0.1)
     assert not alone.camera.states_scale
+    assert alone.camera.header_errors is None
     absolute = next(check for check in alone.checks if check.name == "absolute")
     assert absolute.state == "unknown"
     assert "(match --camera RESULTS)" in absolute.cure
@@ -186,7 +194,7 @@ def test_the_shell_writes_the_camera_of_a_solution(night, first, tmp_path, capsy
         read, known = ld.Camera.read(path), visited.camera
         assert list(read.detectors) == list(known.detectors)
         assert capsys.readouterr().out.endswith(f"px in {path}\n")
-        for name in ("common_map", "common_sigma", "header_map", "place_errors"):
+        for name in ("common_map", "common_sigma", "header_map", "header_errors", "place_errors"):
             one, other = (np.array(getattr(each, name), dtype=float) for each in (read, known))  # None is nan
             np.testing.assert_allclose(one, other, rtol=1e-12)
         for key in known.detectors:
@@ -281,11 +289,15 @@ def test_directions_that_are_not_determined_are_named(night):
 )
 def test_absolute_errors_of_the_next_visit(n_sets, low, high):
     """Of the stars after a similarity: what the reference may be bent by, which it is not, is in those stated."""
-    squares = np.zeros(2)
+    squares, pulls = np.zeros(2), np.zeros(2)
     for seed in range(5, 5 + n_sets):
         night = drawn(seed)
         first = ld.solve(matched(night, 0), static="fit", prior=EVIDENCE, reference=catalogue_of(night, seed))
         second = ld.solve(matched(night, 1, first.camera), prior=EVIDENCE)
         stated = [second.stars[name].value for name in ("x_err_abs", "y_err_abs")]
-        squares += off_sky(night, second)[2] ** 2, np.mean(np.square(stated))
+        scale, turn, left = off_sky(night, second)
+        squares += left**2, np.mean(np.square(stated))
+        pulls += np.square([scale, abs(turn) - abs(ROLLS[1] - ROLLS[0])] / np.array(first.camera.header_errors))
     assert low < squares[0] / squares[1] < high
+    assert (pulls / n_sets > 0.1).all()
+    assert (pulls / n_sets < 1.5).all()

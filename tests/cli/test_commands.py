@@ -221,8 +221,8 @@ def test_wrong_usage_is_told_in_a_line_with_the_nearest_option(capsys, words, me
         pytest.param(getattr(signal, "SIGHUP", signal.SIGTERM), marks=pytest.mark.slow),
     ],
 )
-def test_a_stopped_run_leaves_nothing(night, tmp_path, capsys, monkeypatch, number):
-    """By Ctrl-C, or by a batch system."""
+def test_a_stopped_run_leaves_what_it_measured_alone(night, tmp_path, capsys, monkeypatch, number):
+    """By Ctrl-C, or by a batch system, while it co-adds."""
     (tmp_path / "scratch").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "scratch"))
     monkeypatch.setattr(preparation, "measure_background", lambda *args, **options: os.kill(os.getpid(), number))
@@ -234,7 +234,8 @@ def test_a_stopped_run_leaves_nothing(night, tmp_path, capsys, monkeypatch, numb
     finally:
         signal.signal(number, before)
     assert capsys.readouterr().err.endswith("legdistort: interrupted\n")
-    assert [p.name for p in tmp_path.rglob("*")] == ["scratch"]
+    left = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*"))
+    assert left == ["out.measured", "out.measured/detections.ecsv", "out.measured/summary.json", "scratch"]
 
 
 @pytest.mark.parametrize("kept", ["solution.asdf", "mosaic.fits"])

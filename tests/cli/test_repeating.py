@@ -91,6 +91,8 @@ def test_a_file_asks_no_server(flag, text, tmp_path):
         going_on(tmp_path)
     assert getattr(going_on(tmp_path, flag, text), flag[2:]) == text
     assert getattr(going_on(tmp_path, "--forget", flag[2:]), flag[2:]) is None
+    asked = parser._parsed(["run", "a.fits", "--out", "my out", flag, text, "--degree", "2", "--overwrite"])
+    assert repeating.again(asked) == f"legdistort run --out 'my out' {flag} {text} --overwrite"
 
 
 @pytest.mark.slow

@@ -147,3 +147,5 @@ def test_what_absolute_errors_leave_out_of_a_sky_by_headers():
     assert words.endswith("leave this out, and the error of its scale, which is as they state it")
     by_camera = HeaderPointing(5, 0.5, 0.01).error(0.02, "NIRCAM")
     assert "scale, which is by a reference of camera NIRCAM, as is the rotation but for by how much" in by_camera
+    known = HeaderPointing(5, 0.5, 0.01).error(0.02, "NIRCAM", (2e-5, 0.0012))
+    assert "which is 2e-05 by a reference of camera NIRCAM, as is the rotation (0.001 deg) but for by how much" in known

@@ -1,6 +1,8 @@
 """A run that goes on from what an earlier one has measured."""
 
 import dataclasses
+import json
+import shlex
 import shutil
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from astropy.table import Table
 import legdistort
 from legdistort import Solution
 from legdistort.cli.parser import main
-from legdistort.exceptions import InputError
+from legdistort.exceptions import InputError, SolveError
 from legdistort.inputs.exposure_files import open_exposures
 from legdistort.measurement import positions
 from legdistort.measurement.earlier import EarlierRun, write_detections
@@ -70,6 +72,74 @@ def test_other_options_and_fewer_frames(night, tmp_path, monkeypatch):
     solved = Solution.read("solved")
     np.testing.assert_allclose(three.estimate.positions, solved.estimate.positions, atol=1e-9)
     assert None not in (three.sky, solved.sky)
+
+
+@pytest.fixture
+def failed(night, tmp_path, monkeypatch, capsys):
+    """The last line of a command that measures the night and fails, in a folder of its own."""
+    done = EarlierRun.read(night / "first")
+    monkeypatch.setattr("legdistort.pipeline.measure_with_psfs", lambda *_, **__: (done.table.copy(), done.psfs))
+    shutil.copytree(night / "frames", tmp_path / "my night")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "results.measured").mkdir()
+    (tmp_path / "results.measured" / "detections.ecsv").write_text("of somebody else")
+    frames = [f"my night/exp0{i}.fits" for i in range(4)]
+    for _ in range(2):  # the second takes the place of the first
+        assert main(["run", *frames, "--out", "results", "--no-mosaic", "--degree", "12", "--clip", "0"]) == 1
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_run_that_fails_keeps_what_it_measured(night, failed, monkeypatch):
+    """And its error ends with the command that goes on from there, with the other options as they were."""
+    assert sorted(each.name for each in Path().iterdir()) == ["my night", "results.measured", "results.measured-2"]
+    assert Path("results.measured/detections.ecsv").read_text() == "of somebody else"
+    kept = Path("results.measured-2")
+    assert sorted(each.name for each in kept.iterdir()) == ["detections.ecsv", "psf", "summary.json"]
+    with pytest.raises(InputError, match=r"results.measured-2/solution\.asdf"):  # it is no result
+        Solution.read(kept)
+    words = shlex.split(failed[failed.index("legdistort run") :])
+    assert words == ["legdistort", "run", "--out", "results", "--from", "results.measured-2"]
+    before = EarlierRun.read(kept)
+    first = EarlierRun.read(night / "first")
+    assert all(np.array_equal(before.table[name], first.table[name]) for name in ("exposure", "x", "y", "x_err"))
+    assert list(before.psfs) == list(first.psfs)
+    monkeypatch.setattr("legdistort.pipeline.measure_with_psfs", lambda *_, **__: pytest.fail("measured again"))
+    assert main([*words[1:], "--degree", "2", "--quiet"]) == 0
+    options = json.loads(Path("results/summary.json").read_text())["options"]
+    assert options == {"--no-mosaic": None, "--degree": "2", "--clip": "0.0"}
+
+
+def test_what_was_measured_is_kept_of_files_alone_and_once(night, tmp_path, monkeypatch, caplog):
+    """Not of exposures in memory, and not where an earlier run has it; one that is interrupted says so in the log."""
+    done = EarlierRun.read(night / "first")
+    monkeypatch.setattr("legdistort.pipeline.measure_with_psfs", lambda *_, **__: (done.table.copy(), {}))
+    paths, asked = sorted((night / "frames").glob("exp0[0-3].fits")), {"out": tmp_path / "out", "degree": 12}
+    with pytest.raises(SolveError) as caught:
+        legdistort.run([fits.HDUList([fits.PrimaryHDU(*fits.getdata(each, header=True))]) for each in paths], **asked)
+    assert "kept" not in str(caught.value)
+    with pytest.raises(SolveError) as caught:
+        legdistort.run(earlier=night / "first", **asked)
+    assert ("kept" not in str(caught.value), list(tmp_path.iterdir())) == (True, [])
+    with pytest.raises(SolveError, match=rf"run\(earlier='{tmp_path}/out.measured', out='{tmp_path}/out', \.\.\.\)$"):
+        legdistort.run(paths, **asked)
+    assert [path.name for path in tmp_path.iterdir()] == ["out.measured"]
+    shutil.rmtree(tmp_path / "out.measured")
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    def full(*_, **__):
+        raise OSError(28, "full")
+
+    monkeypatch.setattr("legdistort.pipeline.match", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        legdistort.run(paths, **asked)
+    assert f"what was measured is kept in {tmp_path}/out.measured" in caplog.text
+    monkeypatch.setattr("legdistort.pipeline.write_detections", full)
+    shutil.rmtree(tmp_path / "out.measured")
+    with pytest.raises(KeyboardInterrupt):
+        legdistort.run(paths, **asked)
+    assert ("could not be kept: No space left" in caplog.text, list(tmp_path.iterdir())) == (True, [])
 
 
 @pytest.mark.parametrize("name", ["detections.ecsv", "psf/exp01.fits"])

@@ -59,6 +59,7 @@ def detector(x, seed):
 def camera():
     common = np.concatenate([np.zeros((2, 3)), np.full((2, 7), 0.05)], axis=1)
     known = {"common_map": 1e-3 * (common == 0), "header_map": [[1.0, -0.01, 3.0], [0.01, 1.0, -4.0]]}
+    known["header_errors"] = (2e-5, 0.004)
     known["place_errors"] = [[0.1, 0.2, 0.003], [0.2, 0.1, 0.004]]
     detectors = {"a": detector(10.0, 1), "b": detector(325.0, 2)}
     widths = [np.concatenate([each.layout_sigma, each.static_sigma[:, 3:]], axis=1) for each in detectors.values()]

@@ -161,7 +161,7 @@ class CameraChanges:
         header_map = None if camera.common_map is not None else camera.header_map
         return replace(
             camera, name=name, detectors=detectors, common_sigma=unknown, common_map=None, header_map=header_map,
-            place_errors=None,
+            header_errors=None, place_errors=None,
         )  # fmt: skip
 
     def table(self, camera, scatter):

@@ -68,11 +68,12 @@ class HeaderPointing:
             f"{self.n_used + len(self.off)}"
         )
 
-    def error(self, pixel_scale: float, camera: str = "") -> str:
+    def error(self, pixel_scale: float, camera: str = "", errors: tuple[float, float] | None = None) -> str:
         """What their scatter tells of their errors on a sky of this scale [arcsec], in words; empty without scatter.
 
         That is the least that these can be: guide stars and rolls that all have wrong alike do not scatter. With the
-        name of the `camera` that has the scale, and the rotation beside the headers, from a reference.
+        name of the `camera` that has the scale, and the rotation beside the headers, from a reference, and its
+        `header_errors`.
         """
         if not np.isfinite(self.shift):
             return ""
@@ -81,7 +82,11 @@ class HeaderPointing:
         turn = f", of its rotation {self.turn:.2g} deg" if np.isfinite(self.turn) else ""
         scale = "as they state it"
         if camera:
-            scale = f"by a reference of camera {camera}, as is the rotation but for by how much their rolls differ"
+            of_scale, of_turn = ("", "") if errors is None else (f"{errors[0]:.1g} ", f" ({errors[1]:.1g} deg)")
+            scale = (
+                f"{of_scale}by a reference of camera {camera}, as is the rotation{of_turn} but for by how much their"
+            )
+            scale += " rolls differ"
         return (
             f"by their scatter the error of its pointing is {size} mas per axis at least{turn}; what they all have "
             "wrong alike (guide stars, roll) adds to that and is not known; ra_error_abs and dec_error_abs leave this "

@@ -69,23 +69,58 @@ def pose_numbers(solution):
 
 def _numbers(view, values, known, unknown):
     """The `PoseNumbers` of an exposure, whose coefficients maps (2 n, 2 n_modes) and those that are unknown change."""
-    rows = similarity_basis(view.shape, unknown.shape[1] // 2)
-    poses = similarity_poses(view.shape, unknown.shape[1] // 2)
-    slopes = []
-    for row in rows:
-        step = _STEP * (poses @ row).reshape(2, 3)
-        ends = [_values(view, similarity.compose(np.eye(2, 3) + sign * step, view.pose)) for sign in (1, -1)]
-        change = {name: ends[0][name] - ends[1][name] for name in values}
-        for name in {"rotation", "position_angle"} & set(change):
-            change[name] = (change[name] + 180) % 360 - 180
-        slopes.append([each / (2 * _STEP) for each in change.values()])
-    response = np.transpose(slopes) @ rows
+    response = _response(view, values, unknown.shape[1] // 2)
     of_maps, covariance = known @ response.T, absolute_errors.known_covariance(view.solution.gauge)
     variance = np.diag(response @ view.covariance @ response.T + of_maps.T @ covariance @ of_maps)
     moved = (unknown @ response.T) ** 2
     errors = np.sqrt(np.where((moved > variance).any(axis=0), np.nan, variance)).tolist()
     changes = np.sqrt(moved.sum(axis=0)).tolist()
     return PoseNumbers(values, *(dict(zip(values, each, strict=True)) for each in (errors, changes)))
+
+
+def _response(view, names, size):
+    """How numbers of the pose of an exposure change with its coefficients, shape (n_names, 2 n_modes)."""
+    rows, poses, slopes = similarity_basis(view.shape, size), similarity_poses(view.shape, size), []
+    for row in rows:
+        step = _STEP * (poses @ row).reshape(2, 3)
+        ends = [_values(view, similarity.compose(np.eye(2, 3) + sign * step, view.pose)) for sign in (1, -1)]
+        change = {name: ends[0][name] - ends[1][name] for name in names}
+        for name in {"rotation", "position_angle"} & set(change):
+            change[name] = (change[name] + 180) % 360 - 180
+        slopes.append([each / (2 * _STEP) for each in change.values()])
+    return np.transpose(slopes) @ rows
+
+
+def mean_pose_errors(solution, weights, scatter):
+    """Standard deviations of scale (as a part of it) and rotation [deg] of the mean pose on the sky.
+
+    Parameters
+    ----------
+    solution : Solution
+    weights : ndarray, shape (n_exposures,)
+        Of the mean.
+    scatter : ndarray, shape (2,)
+        Standard deviations of the mean of scale and rotation [rad], by how headers of the exposures differ.
+
+    Returns
+    -------
+    tuple of float, or None
+        Without a reference those of its camera. None without poses that were fitted, or where a map that nothing
+        determines changes them.
+    """
+    gauge, size = solution.gauge, basis.n_modes(solution.degree)
+    if gauge.tie is None:
+        return solution.camera.header_errors
+    if gauge.plane is not None or size < basis.n_modes(1):
+        return None
+    responses = [_response(view, ("scale", "rotation"), size) for view in solution]
+    known = np.moveaxis(absolute_errors.known_changes(gauge, size), 2, 0)
+    unknown = absolute_errors.unknown_changes(gauge, size)
+    of_maps, lost = (np.einsum("i,kim,ivm->kv", weights, each, responses) for each in (known, unknown))
+    own = sum(w**2 * r @ view.covariance @ r.T for w, r, view in zip(weights, responses, solution, strict=True))
+    shared = of_maps.T @ absolute_errors.known_covariance(gauge) @ of_maps
+    variance = np.maximum(np.diag(own), (scatter * [1, np.degrees(1)]) ** 2) + np.diag(shared)
+    return None if (lost**2 > variance).any() else tuple(np.sqrt(variance).tolist())
 
 
 def pose_variances(solution):
