@@ -653,3 +653,20 @@ def test_the_distortion_of_headers_comes_first_where_exposures_hardly_determine_
     assert first == {"reference", "degree", "extrapolation"}
     assert header_first((*wrong, unused)) == (*wrong, unused)
     assert header_first((*wrong, loose)) == (*wrong, loose)
+
+
+def test_a_mirrored_exposure_is_named():
+    """Of one list x and y are exchanged, of another set x runs the other way: the static distortion is not theirs."""
+    table = ld.simulate_matches(n_exposures=6, n_stars=60, dynamic=0.1, seed=5).matches.table
+    plain = ld.solve(ld.Matches.from_table(table, shape=(2048, 2048)), degree=2)
+    assert "mirrored" not in [check.name for check in plain.checks]
+    for exchanged in (lambda x, y: (y, x), lambda x, y: (2047 * u.pix - x, y)):
+        other = table.copy()
+        of = np.isin(other["exposure"], ["exp01", "exp04"])
+        other["x"][of], other["y"][of] = exchanged(table["x"][of].copy(), table["y"][of].copy())
+        solution = ld.solve(ld.Matches.from_table(other, shape=(2048, 2048)), degree=2)
+        checks = {check.name: check for check in solution.checks}
+        assert checks["mirrored"].state == "fail"
+        assert checks["mirrored"].exposures == ("exp01", "exp04")
+        assert checks["mirrored"].cure.endswith("--without exp01 exp04")
+        assert checks["absolute"].state != "pass"

@@ -72,6 +72,30 @@ def dynamic_check(solution, problem, blocks):
     return Check("dynamic part", "pass", p, FALSE_ALARM, found, tests=tests)
 
 
+def mirrored_check(solution, detectors):
+    """Are exposures of a detector mirrored against the others? None where none is.
+
+    No turn makes a detector its mirror image: axes were exchanged, or one reversed, so that the static distortion of
+    such an exposure is not that of the others. `detectors` are numbers (n_exposures,).
+    """
+    reversed_ = np.linalg.det(np.stack([solution.poses[name][:, :2] for name in solution.names])) < 0
+    odd = np.zeros(len(detectors), dtype=bool)
+    for detector in np.unique(detectors):
+        of = detectors == detector
+        odd |= of & (reversed_ if 2 * np.count_nonzero(reversed_ & of) <= np.count_nonzero(of) else ~reversed_)
+    if not odd.any():
+        return None
+    names, share = [name for name, is_odd in zip(solution.names, odd, strict=True) if is_odd], float(odd.mean())
+    one = len(names) == 1
+    found = (
+        f"{some_of(names, MOST_NAMED)} {'is' if one else 'are'} mirrored against the other exposures, as where x and y "
+        f"are exchanged or one of them runs the other way: {'its' if one else 'their'} static distortion is not that "
+        "of the others, and spoils absolute positions"
+    )
+    cure = f"exchange x and y there, or what else is reversed; else --without {shlex.join(names)}"
+    return Check("mirrored", "fail" if share < 0.5 else "warn", share, 0.0, found, cure, exposures=tuple(names))
+
+
 def nights_check(solution, *, error):
     """Does a night depart farther than the others do, and than the error of a star? None where nothing tells."""
     nights = night_table(solution)

@@ -21,7 +21,7 @@ from ...results.gauge import warning_of
 from ..terms.observed import Observed
 from .camera_check import camera_check, contradicted_layout, undetermined
 from .cures import header_first, with_cost, with_cures, without_static
-from .dynamic_check import EVIDENCE, dynamic_check, nights_check, significance
+from .dynamic_check import EVIDENCE, dynamic_check, mirrored_check, nights_check, significance
 from .extrapolated_maps import extrapolation_check
 from .limits import ALIKE, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, UNDETERMINED, addition_that_shows, of_chi2
 from .prior_check import prior_check
@@ -36,8 +36,8 @@ _CAUSES["reference"] = "chi2", "degree", "time"
 _CAUSES["duplicates"] = "nights", "degree", "time", "place"
 #: In this order checks are told.
 _ORDER = (
-    "chi2", "exposures", "brightness", "place", "time", "degree", "dynamic part", "nights", "prior", "reference",
-    "camera", "absolute", "overlaps", "extrapolation", "rejection", "stars", "completeness", "duplicates",
+    "chi2", "exposures", "mirrored", "brightness", "place", "time", "degree", "dynamic part", "nights", "prior",
+    "reference", "camera", "absolute", "overlaps", "extrapolation", "rejection", "stars", "completeness", "duplicates",
     "header distortion", "header pointing",
 )  # fmt: skip
 #: What only residuals tell, and what to do where they tell nothing.
@@ -96,6 +96,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     )
     others = (
         dynamic_check(solution, problem, blocks),
+        mirrored_check(solution, problem.detectors),
         nights_check(solution, error=_star_error(residuals)),
         prior_check(solution, problem, state, error=_star_error(residuals)),
         reference_check(solution, camera),
@@ -377,6 +378,9 @@ def absolute_check(solution, others):
         return Check("absolute", "unknown", len(unknown), 0, sentence, cure + _by_headers(solution, unknown))
     error, reference = solution.gauge.absolute_error, others.get("reference")
     known = f"absolute positions are known to {error:.2g} px rms per axis over the stars, their noise aside"
+    if "mirrored" in others:
+        found = f"{known}, if all exposures had one static distortion, and mirrored ones have another"
+        return Check("absolute", others["mirrored"].state, error, None, found, "see mirrored first, which is the cause")
     if (doubt := absolute_by_reference(reference, solution.gauge.tie, error, known)) is not None:
         return doubt
     return Check("absolute", "pass", error, None, f"{known}; they rest on {_grounds(solution.gauge, others)}")
