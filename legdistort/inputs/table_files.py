@@ -356,8 +356,20 @@ def write_table(table, path, *, kind="ascii.ecsv", overwrite=False):
         elif kind == "fits":
             with without_astropy_warnings():  # of names of columns that are no words of ASCII
                 for_fits(table).write(file, format=kind)
+        elif kind == "votable":
+            _as_votable(table).to_xml(file)
         else:
             with_text(table).write(file, format=kind)
+
+
+def _as_votable(table):
+    """A table as a VOTable with what its ``meta`` says in a word or a number, which astropy leaves out."""
+    from astropy.io.votable import from_table, tree
+
+    made = from_table(with_text(table))
+    said = {key: str(value) for key, value in table.meta.items() if isinstance(value, str | float | int)}
+    made.get_first_table().infos.extend(tree.Info(name=key, value=value) for key, value in said.items())
+    return made
 
 
 def records(table):

@@ -13,7 +13,7 @@ from ..exceptions import AssumptionWarning, MatchError, SolveError, by_reason, s
 from ..geometry import pair_agreement
 from ..geometry.star_hull import enclosed_area
 from . import start_values
-from .checks.limits import ALIKE, MOST_NAMED, UNDETERMINED, of_chi2
+from .checks.limits import ALIKE, MOST_NAMED, UNDETERMINED, UNFOLLOWED, of_chi2
 
 #: Exposures that must agree before others are left out for their sake.
 FEWEST = 3
@@ -52,7 +52,7 @@ def unfollowed(problem, good):
         n = problem.start[i + 1] - problem.start[i]
         n_off = n - np.count_nonzero(good[problem.part(i)])
         if n_off == n or pair_agreement.beyond_chance(n_off, n):
-            why = f"{n_off} of its {n} stars deviate from the solution of the others"
+            why = f"{n_off} of its {n} stars {UNFOLLOWED}"
             out[name] = f"{why} (mismatched, or not this field?)"
     return out | (_alike(problem, [problem.names.index(name) for name in out]) if len(out) > 1 else {})
 

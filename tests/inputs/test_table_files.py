@@ -372,6 +372,9 @@ def test_stars_come_back_from_every_format(solution, tmp_path, ending):
         assert {f.name: f.ucd for f in resource.fields} == {
             name: column_contract.STARS[name][0] for name in stars.colnames
         }
+        said = {info.name: info.value for info in resource.infos}
+        assert said == {key: str(value) for key, value in stars.meta.items() if value is not None}
+        assert said["frame"] == "ICRS"
         back = QTable(resource.to_table(use_names_over_ids=True))
     else:
         back = QTable.read(path, format="ascii.csv" if ending == ".csv" else None)

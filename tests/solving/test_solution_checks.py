@@ -670,3 +670,20 @@ def test_a_mirrored_exposure_is_named():
         assert checks["mirrored"].exposures == ("exp01", "exp04")
         assert checks["mirrored"].cure.endswith("--without exp01 exp04")
         assert checks["absolute"].state != "pass"
+
+
+@pytest.mark.filterwarnings("ignore:exposure exp04 is left out")
+@pytest.mark.parametrize("scrambled", [0.0, 6.0])
+def test_what_is_left_out_beside_a_degree_too_low_may_be_right(scrambled):
+    """Exposures that tell of higher terms, such as turned ones, deviate from a fit that has none."""
+    table = ld.simulate_matches(n_exposures=8, n_stars=80, dynamic=0.3, degree=3, seed=5).matches.table.copy()
+    rows, rng = np.flatnonzero(table["exposure"] == "exp04")[:56], np.random.default_rng(1)
+    for axis in "xy":
+        table[axis][rows] += rng.normal(0, scrambled, len(rows)) * u.pix
+    matches = ld.Matches.from_table(table, shape=(2048, 2048))
+    solution = ld.solve(matches, degree=1, prior=ld.Prior(np.zeros((2, 3))))
+    checks = {check.name: check for check in solution.checks}
+    assert checks["degree"].state == "fail"
+    assert checks["absolute"].state == ("fail" if scrambled else "pass")
+    assert ("(exp04) are right and the degree is too low" in checks["absolute"].sentence) == bool(scrambled)
+    assert checks["rejection"].cure.startswith("see degree first" if scrambled else "")

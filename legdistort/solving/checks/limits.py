@@ -17,6 +17,8 @@ SEEN = 3.0
 ALIKE = "has another distortion"
 #: What is said of exposures left out that have too few stars, or stars in a corner.
 UNDETERMINED = "do not determine its distortion"
+#: What is said of exposures left out that the fit cannot follow.
+UNFOLLOWED = "deviate from the solution of the others"
 #: Names in a sentence.
 MOST_NAMED = 6
 _SURELY = special.ndtri(0.95)

@@ -13,25 +13,25 @@ import numpy as np
 from astropy import units as u
 from scipy import special
 
-from ...exceptions import reasons_of, some_of
-from ...inputs.exposure_names import ASKED
+from ...exceptions import some_of
 from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
 from ...results.errors.header_pointing import CURE as POINTING_CURE
 from ...results.gauge import warning_of
 from ..terms.observed import Observed
 from .camera_check import camera_check, contradicted_layout, undetermined
-from .cures import header_first, with_cost, with_cures, without_static
+from .cures import header_first, with_cost, with_cures
 from .dynamic_check import EVIDENCE, dynamic_check, mirrored_check, nights_check, significance
 from .extrapolated_maps import extrapolation_check
-from .limits import ALIKE, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, UNDETERMINED, addition_that_shows, of_chi2
+from .limits import MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
 from .reference_check import absolute_by_reference, is_told, reference_check
 from .residual_tests import Residuals
-from .star_checks import overlaps_check, stars_check
+from .star_checks import overlaps_check, rejection_check, stars_check, unfollowed
 
 #: What else may be behind a check that does not pass.
 _CAUSES = dict.fromkeys(("time", "prior"), ("degree",)) | {"chi2": ("exposures", "nights", "place", "time", "degree")}
 _CAUSES |= dict.fromkeys(("brightness", "place"), ("degree", "time")) | {"exposures": ("nights", "degree", "time")}
+_CAUSES["rejection"] = ("degree",)
 _CAUSES["reference"] = "chi2", "degree", "time"
 _CAUSES["duplicates"] = "nights", "degree", "time", "place"
 #: In this order checks are told.
@@ -381,6 +381,10 @@ def absolute_check(solution, others):
     if "mirrored" in others:
         found = f"{known}, if all exposures had one static distortion, and mirrored ones have another"
         return Check("absolute", others["mirrored"].state, error, None, found, "see mirrored first, which is the cause")
+    degree = others.get("degree")
+    if degree is not None and degree.state in WRONG and (lost := unfollowed(solution)):
+        found = f"{known}, unless those left out ({some_of(lost, MOST_NAMED)}) are right and the degree is too low"
+        return Check("absolute", degree.state, error, None, found, "see degree first, which may be the cause")
     if (doubt := absolute_by_reference(reference, solution.gauge.tie, error, known)) is not None:
         return doubt
     return Check("absolute", "pass", error, None, f"{known}; they rest on {_grounds(solution.gauge, others)}")
@@ -411,31 +415,6 @@ def _grounds(gauge, others):
     if gauge.poses_known:
         grounds["poses"] = "the errors stated of the poses"
     return " and ".join(grounds.values()) or "dithers and rolls alone"
-
-
-def rejection_check(solution):
-    """Was much left out?"""
-    used = np.asarray(solution.residuals["used"])
-    n, out = len(used), int(np.count_nonzero(~used))
-    share, p = out / n, special.bdtrc(out - 1, n, GROSS_ERRORS) if out else 1.0
-    lost = solution.left_out
-    words = f"{out} of {n} observations ({share:.1%}) were left out" if out else f"all {n} observations were used"
-    if lost:
-        number = f"{len(lost)} exposures were" if len(lost) > 1 else "one exposure was"
-        words += f"; {number} left out: {reasons_of(lost, 3)}"
-    if any(ALIKE in why for why in lost.values()):
-        own = "one distortion is not that of all nights: "
-        cure = f"{own}{without_static(solution)}" if solution.settings.static == "fit" else f"{own}raise --degree"
-        return Check("rejection", "warn", share, GROSS_ERRORS, words, cure)
-    if p < FALSE_ALARM:
-        return Check("rejection", "fail" if share > 0.3 else "warn", share, GROSS_ERRORS, words,
-                     "mismatches or blends: look at the exposures with most of them; match with a smaller --tolerance"
-                     )  # fmt: skip
-    if odd := [why for why in lost.values() if why != ASKED]:
-        cure = "add exposures that overlap them, lower the degree, or give a prior with sigma (--prior-sigma evidence)"
-        cure = cure if all(UNDETERMINED in why for why in odd) else "look at these frames"
-        return Check("rejection", "warn", share, GROSS_ERRORS, words, cure)
-    return Check("rejection", "pass", share, GROSS_ERRORS, words)
 
 
 def completeness_check(solution, residuals):

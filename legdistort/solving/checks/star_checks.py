@@ -1,12 +1,14 @@
-"""Checks of the stars: are they worse than their measurements, and do some contradict themselves?"""
+"""Checks of the stars: are they worse than their measurements, do some contradict themselves, was much left out?"""
 
 import numpy as np
 from scipy import special
 
-from ...exceptions import some_of
+from ...exceptions import reasons_of, some_of
+from ...inputs.exposure_names import ASKED
 from ...results.check import FALSE_ALARM, Check
 from ..equations.elimination import inverse_star_blocks
-from .limits import MOST_NAMED
+from .cures import without_static
+from .limits import ALIKE, GROSS_ERRORS, MOST_NAMED, UNDETERMINED, UNFOLLOWED
 
 #: Errors of stars over those of their measurements beyond which exposures hang together by too little. Of 150 sets of 4
 #: to 40 exposures with 20 to 1000 stars on a frame, without a prior, one is beyond 3.2; a mosaic of 3 x 3 has 2.3 with
@@ -140,3 +142,33 @@ def _groups(off, sigma):
     sizes = np.unique(np.linspace(1, len(off) - 1, _CUTS).round().astype(int))
     cuts = [np.isin(np.arange(len(off)), order[:k]) for k in sizes]
     return min(cuts, key=lambda cut: _left(off, sigma, [cut, ~cut]))
+
+
+def rejection_check(solution):
+    """Was much left out?"""
+    used = np.asarray(solution.residuals["used"])
+    n, out = len(used), int(np.count_nonzero(~used))
+    share, p = out / n, special.bdtrc(out - 1, n, GROSS_ERRORS) if out else 1.0
+    lost = solution.left_out
+    words = f"{out} of {n} observations ({share:.1%}) were left out" if out else f"all {n} observations were used"
+    if lost:
+        number = f"{len(lost)} exposures were" if len(lost) > 1 else "one exposure was"
+        words += f"; {number} left out: {reasons_of(lost, 3)}"
+    if any(ALIKE in why for why in lost.values()):
+        own = "one distortion is not that of all nights: "
+        cure = f"{own}{without_static(solution)}" if solution.settings.static == "fit" else f"{own}raise --degree"
+        return Check("rejection", "warn", share, GROSS_ERRORS, words, cure)
+    if p < FALSE_ALARM:
+        return Check("rejection", "fail" if share > 0.3 else "warn", share, GROSS_ERRORS, words,
+                     "mismatches or blends: look at the exposures with most of them; match with a smaller --tolerance"
+                     )  # fmt: skip
+    if odd := [why for why in lost.values() if why != ASKED]:
+        cure = "add exposures that overlap them, lower the degree, or give a prior with sigma (--prior-sigma evidence)"
+        cure = cure if all(UNDETERMINED in why for why in odd) else "look at these frames"
+        return Check("rejection", "warn", share, GROSS_ERRORS, words, cure)
+    return Check("rejection", "pass", share, GROSS_ERRORS, words)
+
+
+def unfollowed(solution):
+    """Names of exposures left out since most of their stars deviate from a fit of the others."""
+    return [name for name, why in solution.left_out.items() if UNFOLLOWED in why]
