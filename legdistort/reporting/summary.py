@@ -94,7 +94,7 @@ _POSE = {
 
 
 def nights(solution, found):
-    """One dict of numbers a night, or other block, odd ones first: `Solution.nights`, and what `exposures` gives.
+    """One dict of numbers a night, or other block, the worst first: `Solution.nights`, and what `exposures` gives.
 
     `common_px` is the size of their mean departure from the static distortion, `common_err_px` that of its standard
     error, by how they scatter about it; None of one exposure.

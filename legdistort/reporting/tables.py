@@ -110,7 +110,7 @@ def exposures_table(solution, shapes=None):
 
 
 def nights_table(solution):
-    """One row a night, odd ones first, then in time, as `Solution.nights` has it; None of a single one."""
+    """One row a night, the worst first, as `Solution.nights` has it; None of a single one."""
     nights = solution.nights
     if len(nights) < 2:
         return None
@@ -130,9 +130,9 @@ def nights_table(solution):
     return Table(
         head,
         rows,
-        "Odd ones first, then in time. Departure: what the exposures of a night have in common, from the static "
-        "distortion of all other nights; over the scatter of these and all errors; p is the probability of so much by "
-        "chance. Nights that depart farther than the others do are marked, and the rest is compared without them.",
+        "The worst first. Departure: what the exposures of a night have in common, from the static distortion of all "
+        "other nights; over the scatter of these and all errors; p is the probability of so much by chance. Nights "
+        "that depart farther than the others do are marked, and the rest is compared without them.",
     )
 
 

@@ -128,7 +128,7 @@ def table(solution):
                 "exposures": ", ".join(np.array(solution.names)[own]),
             }
         )
-    out = NightsTable(rows=sorted(rows, key=lambda row: (not row["odd"], row["block"])))
+    out = NightsTable(rows=sorted(rows, key=lambda row: (not row["odd"], row["p"], -row["ratio"])))
     for name, unit in {"epoch": u.yr, "rms": u.pix, "departure": u.pix}.items():
         out[name] = out[name] * unit
     for name, shown in _FORMATS.items():

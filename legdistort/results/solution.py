@@ -172,7 +172,7 @@ class Solution(ShownAsPrinted):
 
     @cached_property
     def nights(self) -> QTable:
-        """One row a night, or other block of exposures (`Matches.blocks`): which one differs? Odd first, then in time.
+        """One row a night, or other block of exposures (`Matches.blocks`): which one differs? The worst first.
 
         ``name`` (the label of the column ``block``, else the date), ``block`` (its number), ``epoch`` [yr],
         ``n_exposures``, ``n_stars``; ``rms`` [pix] of its residuals, per axis, and ``rms_ratio`` of these over their

@@ -70,7 +70,7 @@ def test_every_exposure_is_in_figures():
         assert (each["shift_x_px"], each["shift_y_px"]) == tuple(matrix[:, 2])
         assert each["position_angle_deg"] is None
     assert sorted(night["exposures"] for night in found["nights"]) == [[f"n{i}e0", f"n{i}e1"] for i in range(3)]
-    assert [night["block"] for night in found["nights"]] == solution.nights["block"].tolist()  # odd ones first
+    assert [night["block"] for night in found["nights"]] == solution.nights["block"].tolist()  # the worst first
     assert found["detectors"] == []
 
 
