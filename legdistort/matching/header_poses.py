@@ -282,7 +282,7 @@ def header_map_by(matches, poses, sky, variances):
     turned = np.array(by_header) - np.mean(by_header, axis=1, keepdims=True)
     weights = _weights(turned.reshape(len(poses), -1), np.asarray(variances))
     found = similarity.fit_similarity(np.average(by_header, axis=0, weights=weights), corners)
-    z, w = (turned @ [1, 1j] for turned in (turned, (corners - corners.mean(axis=0))))
+    z, w = (offsets @ [1, 1j] for offsets in (turned, corners - corners.mean(axis=0)))
     moved = z @ w.conj() / np.vdot(w, w)  # of every exposure, scale and rotation as one number
     off = np.stack([np.abs(moved), np.angle(moved / moved.mean())], axis=1)
     share = 1 - np.sum(weights**2)

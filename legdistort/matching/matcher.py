@@ -26,7 +26,7 @@ from ..inputs.exposures import Exposure, stated_numbers
 from ..inputs.star_lists.bad_places import without_bad_places
 from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
-from ..measurement.flags import UNUSABLE, Flag
+from ..measurement.flags import UNUSABLE, Flag, flags_of
 from ..priors.from_headers import describe, header_distortions
 from ..runtime import parallel
 from ..runtime.guards.units import plain_numbers
@@ -57,8 +57,6 @@ FEW_HOT = 0.05
 _MOST_PLACINGS = 4
 #: Detections that a layout must gain in which detectors lie elsewhere than in an exact one.
 _FEWEST_GAINED = 10
-#: Larger numbers are no flags: the bits of 32.
-LARGEST_FLAGS = 2.0**32 - 1
 
 
 @plain_numbers
@@ -339,7 +337,7 @@ def _without_flagged(table, reject_flags):
     """The table without rows of which a flag is to be rejected; a missing flag is none."""
     if "flags" not in table.colnames:
         return table
-    flags = np.nan_to_num(np.clip(table["flags"], 0, LARGEST_FLAGS)).astype(int)
+    flags = flags_of(table)
     good = (flags & reject_flags) == 0
     counts = {flag.name: np.count_nonzero(flags & flag) for flag in Flag if flag & reject_flags}
     named = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
@@ -358,8 +356,7 @@ def _at_edges(table, reject_flags):
     """Detections at the edge of an image that are rejected for no other reason."""
     if "flags" not in table.colnames:
         return table[:0]
-    flags = np.nan_to_num(np.clip(table["flags"], 0, LARGEST_FLAGS)).astype(int)
-    return table[(flags & reject_flags) == Flag.EDGE]
+    return table[(flags_of(table) & reject_flags) == Flag.EDGE]
 
 
 def _without_repetitions(table):

@@ -14,7 +14,7 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial import KDTree
 
 from ..exceptions import InputError
-from .flags import Flag
+from .flags import Flag, flags_of
 from .profiles.shape_field import deviation, shape_field, usual
 
 #: Largest `crowding` of a star called isolated: what subtraction leaves of it is then a small part of its error.
@@ -71,17 +71,12 @@ def is_isolated(table, limit=LIMIT):
     if limit is None or limit == np.inf or not {"crowding", "flags"} & set(table.colnames):
         return isolated
     if "crowding" not in table.colnames:  # how far a neighbour pulls is not known
-        clean = (_flags(table) & Flag.BLENDED) == 0
+        clean = (flags_of(table) & Flag.BLENDED) == 0
         return clean if np.count_nonzero(clean) >= CLEAN * len(table) else isolated
     isolated = np.asarray(table["crowding"], dtype=float) <= limit
     if "flags" in table.colnames:
-        isolated &= (np.asarray(table["flags"]).astype(int) & Flag.DEFORMED) == 0
+        isolated &= (flags_of(table) & Flag.DEFORMED) == 0
     return isolated
-
-
-def _flags(table):
-    """Flags (n,) of a table of another program; a missing one is none."""
-    return np.nan_to_num(np.clip(np.ma.filled(table["flags"], 0), 0, 2**31)).astype(int)
 
 
 def displacement(xy, flux, fwhm, *, sources=None):

@@ -2,6 +2,8 @@
 
 from enum import IntFlag
 
+import numpy as np
+
 
 class Flag(IntFlag):
     """Bits of the column ``flags``."""
@@ -30,3 +32,10 @@ LEAST = 3.0
 TRAILED = 2.0
 #: Part of the light of a star that persists where it was, at most; defects of one place differ by less.
 PERSISTS = 0.1
+#: Larger numbers are no flags: the bits of 32.
+_LARGEST = 2.0**32 - 1
+
+
+def flags_of(table):
+    """Flags (n,) of the detections of a table with a column ``flags``; a missing flag is none."""
+    return np.nan_to_num(np.clip(np.ma.filled(table["flags"], 0), 0, _LARGEST)).astype(int)

@@ -6,6 +6,7 @@ import numpy as np
 from scipy import special
 
 from ...exceptions import some_of
+from ...geometry import similarity
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...results.check import FALSE_ALARM, Check, FactorTest, state_of
 from ...results.errors import absolute_errors
@@ -78,7 +79,8 @@ def mirrored_check(solution, detectors):
     No turn makes a detector its mirror image: axes were exchanged, or one reversed, so that the static distortion of
     such an exposure is not that of the others. `detectors` are numbers (n_exposures,).
     """
-    reversed_ = np.linalg.det(np.stack([solution.poses[name][:, :2] for name in solution.names])) < 0
+    parities = [similarity.describe(solution.poses[name])["parity"] for name in solution.names]
+    reversed_ = np.array(parities) < 0
     odd = np.zeros(len(detectors), dtype=bool)
     for detector in np.unique(detectors):
         of = detectors == detector
