@@ -18,19 +18,17 @@ from night_sets import SIZE, Nights
 
 import legdistort as ld
 
+ALIKE = {"nightly": 0.0, "single": 0.03}
+#: Every kind of night by the roll of the last three of eight, and by whether stars move.
 SETTINGS = {
-    "8 nights, roll 30": {},
-    "the same with motions": {"motion": 0.25},
-    "independent, roll 30": {"nightly": 0.0, "single": 0.03},
-    "independent, roll 0.7": {"nightly": 0.0, "single": 0.03, "roll": 0.7},
-    "independent, roll 30, motions": {"nightly": 0.0, "single": 0.03, "motion": 0.25},
-    "roll 0.7": {"roll": 0.7},
-    "odd night, roll 30": {"odd": 0.5},
-    "odd night, roll 0.7": {"odd": 0.5, "roll": 0.7},
-    "odd night, roll 0": {"odd": 0.5, "roll": 0.0},
-    "odd night, independent": {"odd": 0.5, "nightly": 0.0, "single": 0.03},
+    f"{kind}, roll {roll}{', motions' if moves else ''}": words | {"roll": roll} | ({"motion": 0.25} if moves else {})
+    for kind, words in {"8 nights": {}, "independent": ALIKE, "odd night": {"odd": 0.5}}.items()
+    for roll in (0, 0.7, 30)
+    for moves in (False, True)
+}
+SETTINGS |= {
+    "odd night, independent": {"odd": 0.5} | ALIKE,
     "odd night of one exposure": {"odd": 0.5, "alone": True},
-    "odd night, roll 0.7, motions": {"odd": 0.5, "roll": 0.7, "motion": 0.25},
     "2 nights": {"nights": 2},
     "3 nights": {"nights": 3},
     "3 nights, one odd, roll 0.7": {"nights": 3, "odd": 0.5, "roll": 0.7},
@@ -59,7 +57,9 @@ def solved(table, words):
 def square(nights, solution):
     """Squares of absolute errors and their variances, of the finite ones, and the mean square error."""
     off = nights.offsets(solution.stars, solution.stars.meta.get("epoch") or 2017.0)
-    stated = np.column_stack([solution.stars[c].value for c in ("x_err_abs", "y_err_abs")])
+    stated = np.full(off.shape, np.nan)
+    if "x_err_abs" in solution.stars.colnames:  # else nothing is known of any
+        stated = np.column_stack([solution.stars[c].value for c in ("x_err_abs", "y_err_abs")])
     finite = np.isfinite(stated) & np.isfinite(off)
     return np.sum(off[finite] ** 2), np.sum(stated[finite] ** 2), np.nanmean(off**2)
 
