@@ -12,6 +12,7 @@ from ..geometry.tabulated.covariance_table import CovarianceTable
 from ..geometry.tabulated.displacement_table import DisplacementTable
 from ..runtime.trees.facts import array
 from .errors.camera_errors import CameraErrors
+from .errors.coefficient_covariance import exposure_block
 from .errors.common_maps import CommonFit
 from .gauge import UnknownDirection
 from .motions import StarMotions
@@ -112,6 +113,10 @@ class StoredUncertainty:
         default=None, metadata=array("n_stars", "2 + n_terms", "2 n_plane_modes + n_drift", nan=True)
     )
     camera: CameraErrors | None = None
+
+    def of_exposure(self, i: int, n_exposures: int) -> np.ndarray:
+        """Covariance of the coefficients of exposure i of so many alone, shape (2 n_modes, 2 n_modes)."""
+        return exposure_block(self.coefficients, n_exposures, i)
 
 
 def plain_covariances(estimate):

@@ -1,7 +1,8 @@
 """Table of the solvers on three data sets: time, peak memory, b, sigma, chi2, each in a process of its own.
 
-Run ``python tests/benchmarks/solver_table.py [--scaling | --ratios | --covariances | --degrees]``. Times are the
-best of three after a first call (which loads compiled code); memory is what the process needed beyond data and imports.
+Run ``python tests/benchmarks/solver_table.py [--scaling | --ratios | --covariances | --survey | --degrees]``. Times are
+the best of three after a first call (which loads compiled code); memory is what the process needed beyond data and
+imports.
 """
 
 import argparse
@@ -126,6 +127,32 @@ def degrees(n_exposures, n_stars):
     return [min(each) for each in times.values()]
 
 
+def survey(n_exposures, n_stars, seen):
+    """CPU time of many exposures that see a part of the stars: solution, errors, file."""
+    import tempfile
+
+    from legdistort import Solution, simulate_matches, solve
+
+    warnings.simplefilter("ignore")
+    sim = simulate_matches(n_exposures=n_exposures, n_stars=n_stars, seen=seen, degree=3, seed=1)
+    solve(sim.matches)  # loads compiled loops
+    with tempfile.TemporaryDirectory() as folder:
+        file, out = Path(folder) / "solution.asdf", {}
+
+        def timed(name, function):
+            begin = time.process_time()
+            result = function()
+            out[name] = time.process_time() - begin
+            return result
+
+        solution = timed("solve", lambda: solve(sim.matches))
+        timed("stars", lambda: solution.stars)
+        timed("exposures", lambda: [solution[name].covariance for name in solution.names])
+        timed("write", lambda: solution.write(file))
+        timed("read", lambda: Solution.read(file))
+    return out
+
+
 def run(*arguments):
     """A row from a process of its own."""
     command = [sys.executable, __file__, "--row", *map(str, arguments)]
@@ -153,6 +180,7 @@ def main():
     parser.add_argument("--scaling", action="store_true")
     parser.add_argument("--ratios", action="store_true", help="time of scipy over ours, and of rejection")
     parser.add_argument("--covariances", action="store_true", help="errors of all stars, many exposures or many stars")
+    parser.add_argument("--survey", action="store_true", help="CPU time where exposures see a part of the stars")
     parser.add_argument("--degrees", action="store_true", help="CPU time of degree='auto' over a given degree")
     arguments = parser.parse_args()
     logging.disable(logging.WARNING)  # of what is not known without a prior
@@ -174,6 +202,11 @@ def main():
         for n_exposures, n_stars in ((11, 80), (11, 300), (30, 1000)):
             given, chosen = degrees(n_exposures, n_stars)
             print(f"{n_exposures:9d} x {n_stars:5d} {given:13.3f} {chosen:9.2f} {chosen / given:16.1f}", flush=True)
+    elif arguments.survey:
+        for n_exposures, n_stars, seen in ((600, 3000, 0.025), (2000, 10_000, 0.008)):
+            times = survey(n_exposures, n_stars, seen)
+            cells = "  ".join(f"{name} {each:.2f} s" for name, each in times.items())
+            print(f"{n_exposures} x {seen * n_stars:.0f} of {n_stars}: {cells}", flush=True)
     elif arguments.covariances:
         for n_exposures, n_stars in ((150, 30), (2000, 30), (400, 60), (100, 3000), (500, 2000), (500, 5000)):
             show(run("large", "joint", n_exposures, n_stars))

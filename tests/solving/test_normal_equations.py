@@ -257,6 +257,8 @@ def test_errors_are_the_same_whichever_side_is_eliminated(case, monkeypatch):
     close(small.coefficients, exposure_blocks(dense.coefficients, N))
     close(small.star_unknowns, dense.star_unknowns)
     close(small.star_matrix, dense.star_matrix)
+    for made in (Uncertainty(problem, blocks, gauge, scale=1.5), dense):  # coefficients made, and not yet
+        close(np.stack([made.of_exposure(i, N) for i in range(N)]), small.coefficients)
     monkeypatch.setattr(reduced_system, "STAR_LIMIT", 10)
     rough = Uncertainty(problem, blocks, gauge, scale=1.5)
     with pytest.warns(AssumptionWarning, match=r"errors of 16 stars solved exactly are ([0-9.]+) times") as caught:
@@ -265,6 +267,21 @@ def test_errors_are_the_same_whichever_side_is_eliminated(case, monkeypatch):
     ratio = np.sqrt(dense.star_unknowns[:2] / variance[:2])[np.arange(M) % 2, np.arange(M)]
     assert told == pytest.approx(np.median(ratio), rel=1e-3)
     assert told > 1.02
+
+
+@pytest.mark.parametrize("in_blocks", [False, True])
+def test_errors_of_one_star_that_some_exposures_have_not_seen(case, in_blocks):
+    """They are those of all stars together."""
+    problem, state, blocks, _ = case
+    gauge = constraints.make("minimal", problem, state, blocks)
+    seen = np.zeros((N, M), bool)
+    seen[problem.exposure, problem.star] = True
+    [star] = np.flatnonzero(~seen.all(axis=0))[:1]
+    coefficients = Uncertainty(problem, blocks, gauge).coefficients
+    coefficients = exposure_blocks(coefficients, N) if in_blocks else coefficients
+    found = Uncertainty(problem, blocks, gauge, coefficients=coefficients)
+    both = [star, star + M]
+    close(found.covariance_between(np.array([star]), 2), found.star_matrix[np.ix_(both, both)])
 
 
 def test_star_errors_need_no_covariance_of_the_coefficients(case):

@@ -8,7 +8,6 @@ relative errors.
 
 import numpy as np
 
-from .coefficient_covariance import exposure_block
 from .common_maps import plain_maps
 
 
@@ -101,7 +100,7 @@ def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
 
 def own_coefficients(gauge, uncertainty, i):
     """Covariance (2 n_modes, 2 n_modes) of the coefficients of exposure i in the gauge, a camera taken as known."""
-    return exposure_block(uncertainty.coefficients, len(gauge.motion), i)
+    return uncertainty.of_exposure(i, len(gauge.motion))
 
 
 def relative_coefficients(gauge, uncertainty, i):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...exceptions import AssumptionWarning, SolveError, warn
-from ...results.errors.coefficient_covariance import times
+from ...results.errors.coefficient_covariance import exposure_block, times
 from ...results.errors.common_maps import CommonFit, modes_for, of_normal, plain_maps
 from ...results.gauge import UnknownDirection
 from . import criterion, elimination, reduced_system
@@ -83,8 +83,19 @@ class Uncertainty:
         if self._is_dense:
             return self._scale**2 * self._direct.covariance()
         if self._on_stars is not None:
-            return self._scale**2 * self._on_stars.covariance_blocks()
+            return self._own
         return self._scale**2 * self._approximated
+
+    def of_exposure(self, i: int, n_exposures: int) -> np.ndarray:
+        """That of exposure i of so many alone, shape (2 n_modes, 2 n_modes), without that between them if possible."""
+        if "coefficients" not in vars(self) and self._on_stars is not None:
+            return self._own[i]
+        return exposure_block(self.coefficients, n_exposures, i)
+
+    @cached_property
+    def _own(self):
+        """Covariance of the coefficients of every exposure, from that of all stars."""
+        return self._scale**2 * self._on_stars.covariance_blocks()
 
     @cached_property
     def _direct(self):
@@ -404,7 +415,7 @@ class Uncertainty:
             on = seen >= 0
             f, b = blocks.coupling[:, :, part][:, :, on], blocks.values[:, part][:, on]
             pulled = problem.terms.pull(i, np.einsum("can,mn->camn", f, b))
-            coupling[:, seen[on], i] = np.moveaxis(pulled, 3, 1).reshape(problem.n_star, b.shape[1], -1)
+            coupling[:, seen[on], i] = np.moveaxis(pulled, 3, 1).reshape(problem.n_star, b.shape[1], coupling.shape[-1])
         coupling = coupling.reshape(problem.n_star, n, -1)
         return inverse, np.concatenate([np.einsum("jb,bjk->jk", inverse[:, a], coupling) for a in range(size)])
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 
 from ...geometry.detector_modes import dynamic_basis
-from ...results.errors.coefficient_covariance import exposure_blocks
 from . import criterion
 
 
@@ -21,7 +20,7 @@ def done_by_prior(problem, uncertainty):
     """
     if not problem.has_prior and problem.pose_width is None:
         return np.zeros(problem.n_exposures)
-    blocks = exposure_blocks(uncertainty.coefficients, problem.n_exposures)
+    blocks = [uncertainty.of_exposure(i, problem.n_exposures) for i in range(problem.n_exposures)]
     out = np.array([np.sum(criterion.prior_precision(problem, i) * block) for i, block in enumerate(blocks)])
     if problem.pose_width is not None:
         poses = zip(criterion.pose_precision(problem), blocks, strict=True)

@@ -14,16 +14,15 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import LinAlgError, lu_factor, lu_solve
-from scipy.linalg.lapack import dgecon
+from scipy.linalg.lapack import dgecon, dgetri
 
 from . import elimination
 from .reduced_base import Reduced
 from .star_terms import packed, unpacked
 
-#: Numbers held at once while exposures are eliminated.
-_BLOCK = 2**23
 #: Reciprocal condition below which K, and least pivot below which a block of U, counts as singular.
 _SINGULAR, LEAST_PIVOT = 1e-14, 1e-4
+_BLOCKED = 64  # columns at once of an inverse, which LAPACK makes one by one without room for them
 #: Part of the information on a star, left when exposures with hardly more stars than modes are free, that is rounding.
 _LOST = 1e-8
 
@@ -63,8 +62,8 @@ class OnStars(Reduced):
         self._determined = self.inverse[np.diag(packed(problem.n_star))] > 0
         matrix = self._of_stars()
         before = np.diag(matrix).copy()
-        for _, factor in self._factors():
-            matrix -= factor @ factor.T
+        for on, factor in self._factors():
+            matrix[on[:, None], on] -= factor @ factor.T
         left = np.abs(np.diag(matrix))
         if not (left > _LOST * before).all():
             raise LinAlgError
@@ -87,24 +86,17 @@ class OnStars(Reduced):
         return out
 
     def _factors(self):
-        """Yield some exposures and ``[E; R] root`` of theirs, (size, n * 2 n_modes), for all exposures in turn."""
-        problem, blocks, rows = self.problem, self.blocks, self.rows
-        (n_star, n_stars), k = self._determined.shape, 2 * problem.n_modes
-        rows = rows.reshape(len(rows), problem.n_exposures, k)
-        size = n_star * n_stars + len(rows)
-        step = max(1, _BLOCK // (size * k))
-        for first in range(0, problem.n_exposures, step):
-            several = range(first, min(first + step, problem.n_exposures))
-            out = np.zeros((size, len(several), k))
-            stars = out[: n_star * n_stars].reshape(n_star, n_stars, len(several), k)
-            for place, i in enumerate(several):
-                part = problem.part(i)
-                f, b = blocks.coupling[:, :, part], blocks.values[:, part]
-                pulled = problem.terms.pull(i, f[:, :, None] * b).reshape(n_star, k, -1)
-                stars[:, problem.star[part], place] = pulled.swapaxes(1, 2) @ self._roots[i]
-            stars *= self._determined[:, :, None, None]
-            out[n_star * n_stars :] = np.einsum("cik,ikm->cim", rows[:, several], self._roots[several])
-            yield several, out.reshape(size, -1)
+        """Yield of every exposure the rows of the matrix that it has a part in, and ``[E; R] root`` there."""
+        problem, blocks, n_star = self.problem, self.blocks, len(self._determined)
+        k, of_stars = 2 * problem.n_modes, np.arange(self._determined.size).reshape(self._determined.shape)
+        constraints = self._determined.size + np.arange(len(self.rows))
+        own = self.rows.reshape(len(self.rows), problem.n_exposures, k)
+        for i, root in enumerate(self._roots):
+            part = problem.part(i)
+            seen, f, b = problem.star[part], blocks.coupling[:, :, part], blocks.values[:, part]
+            pulled = problem.terms.pull(i, f[:, :, None] * b).reshape(n_star, k, -1)
+            stars = (pulled.swapaxes(1, 2) * self._determined[:, seen, None]).reshape(-1, k)
+            yield np.append(of_stars[:, seen], constraints), np.concatenate([stars, own[:, i]]) @ root
 
     def _inverse_times(self, right):
         unit = self._unit if right.ndim == 1 else self._unit[:, None]
@@ -157,8 +149,12 @@ class OnStars(Reduced):
 
     @cached_property
     def _inverse_matrix(self):
-        out = self._inverse_times(np.eye(len(self._unit)))
-        return (out + out.T) / 2
+        inverse, failed = dgetri(*self._factor, lwork=_BLOCKED * len(self._unit))
+        if failed:
+            raise LinAlgError
+        inverse *= self._unit[:, None]
+        inverse *= self._unit
+        return (inverse + inverse.T) / 2
 
     @property
     def star_covariance(self):
@@ -170,10 +166,7 @@ class OnStars(Reduced):
     def covariance_blocks(self):
         """Covariance of the coefficients of every exposure in the gauge, shape (n_exposures, 2 n_modes, 2 n_modes)."""
         out = np.empty_like(self._roots)
-        for several, factor in self._factors():
-            moved = (self._inverse_matrix @ factor).reshape(len(factor), len(several), -1)
-            factor = factor.reshape(moved.shape)
-            roots = self._roots[several]
-            inner = np.eye(roots.shape[1]) + factor.transpose(1, 2, 0) @ moved.transpose(1, 0, 2)
-            out[several] = roots @ inner @ roots.mT
+        for i, (on, factor) in enumerate(self._factors()):
+            inner = np.eye(factor.shape[1]) + factor.T @ self._inverse_matrix[on[:, None], on] @ factor
+            out[i] = self._roots[i] @ inner @ self._roots[i].T
         return out
