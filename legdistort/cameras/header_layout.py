@@ -24,6 +24,8 @@ FAR = 20.0
 CHANCE = 4e-3
 #: Pixels of two detectors are of the same size by headers to this: distortions make up for so much.
 _SAME_SCALE = 1.01
+#: By less than this [deg, part] no detector is otherwise turned, or larger, for dithers: `legdistort.solve` finds that.
+ANGLE_SAME, SCALE_SAME = 3.0, 0.03
 #: A mirrored detector is not turned if it is by less than this [deg].
 _SAME_ANGLE = 0.1
 #: Pairs of detectors at most that are tried as those that agree.
@@ -85,7 +87,7 @@ class HeaderLayout:
 
     @cached_property
     def scales(self):
-        """Sizes of pixels by the headers over what they are, of each detector; those that agree have 1 on average, (n,)."""
+        """Sizes of pixels by the headers over what they are, (n,); those that agree have 1 on average."""
         logs = _log_scales(self.own)
         return np.exp(logs - logs[self.agree].mean())
 
@@ -167,13 +169,17 @@ def orientation_in_words(angle, scale, *, mirrored, error=""):
     error : str
         That of the angle, in words.
     """
+    larger = f"its pixels {scale:.3f} times as large as they are" if scale != 1 else ""
+    angle = abs(angle) if abs(angle) > 180 - _SAME_ANGLE / 10 else angle
     words = f"turned by {angle:.2f}{error} deg"
     if mirrored:
         nearest = round(angle / 90) % 4
         axes = "y reversed", "x and y exchanged", "x reversed", "x and y exchanged and both reversed"
         rest = (angle - 90 * nearest + 180) % 360 - 180
         words = f"mirrored, {axes[nearest]}" + (f", turned by {rest:.2f} deg" if abs(rest) > _SAME_ANGLE else "")
-    return words + (f", its pixels {scale:.3f} times as large as they are" if scale != 1 else "")
+    elif larger and abs(angle) < _SAME_ANGLE and not error:
+        return larger
+    return f"{words}, {larger}" if larger else words
 
 
 def _told_error(error):
@@ -184,7 +190,7 @@ def compare_headers(detectors):
     """The `HeaderLayout` of a camera; None if headers state nothing of it, or it has no place for two detectors.
 
     Detectors whose places nothing determined are not compared; if there are no others, places are where the layout
-    begins, and none contradicts another.
+    begins, and none contradicts another but one that is mirrored or turned, since dithers contradict its header.
 
     Parameters
     ----------
@@ -205,7 +211,7 @@ def compare_headers(detectors):
     stated, lie = places("header_layout"), places("layout")
     own = np.array([_fitted(stated, lie, [k]) for k in range(len(stated))])
     found = _rigid(stated, lie, own)
-    agree = _agreeing(stated, found, own) if len(known) > 1 else np.ones(len(names), dtype=bool)
+    agree = _agreeing(stated, found, own) if len(known) > 1 else ~_otherwise_turned(own)
     return HeaderLayout(tuple(names), stated, found, own, agree)
 
 
@@ -239,6 +245,23 @@ def _unlike(own):
     parity, logs = np.sign(np.linalg.det(own[:, :, :2])), _log_scales(own)
     scale = np.abs(logs - np.median(logs)) > np.log(_SAME_SCALE)
     return (parity != np.sign(parity.sum() or parity[0])) | scale
+
+
+def _otherwise_turned(own):
+    """Detectors (n,) of layouts to begin with that are not as headers have them since dithers contradict these.
+
+    Where they are is no matter of it: these shifts are not known.
+    """
+    turn = own[:, :, :2]
+    parity, logs = np.linalg.det(turn) > 0, _log_scales(own)
+    angle = np.degrees(np.arctan2(turn[:, 1, 0], turn[:, 0, 0]))
+    like = [
+        (parity == parity[k])
+        & (np.abs(logs - logs[k]) < np.log(1 + SCALE_SAME))
+        & (np.abs((angle - angle[k] + 180) % 360 - 180) < ANGLE_SAME)
+        for k in range(len(own))
+    ]
+    return ~max(like, key=np.count_nonzero)
 
 
 def _agreeing(stated, found, own):

@@ -9,7 +9,7 @@ from ...cameras import ties
 from ...cameras.header_layout import FAR, LEAST, compare_headers
 from ...exceptions import some_of
 from ...geometry import similarity
-from ...matching.detector_places import REACH, TURNS
+from ...matching.detectors.detector_places import REACH, TURNS
 from ...results.check import WRONG, Check, FactorTest, state_of
 from .known_effects import DEPARTURES, LAYOUT, STATICS
 from .limits import MOST_NAMED, SEEN, addition_that_shows, as_one
