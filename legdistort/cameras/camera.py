@@ -334,8 +334,13 @@ class Camera(ShownAsPrinted):
                 f"the table has no column detector, which of {', '.join(self.detectors)} of camera {self.name}: add it"
             )
         detector = np.asarray(table["detector"]).astype(str)
-        for key in np.unique(detector):
-            self[key]  # refuses an unknown one
+        keys = np.unique(detector).tolist()
+        if unknown := [key for key in keys if key not in self.detectors]:
+            raise InputError(
+                f"camera {self.name} has no detector {unknown[0]!r}; it has {', '.join(self.detectors)}, and the "
+                f"column detector has {', '.join(keys)}, not the same numbers each once: rename these in the column, "
+                "or give the camera of these detectors"
+            )
         return detector
 
     @plain_numbers

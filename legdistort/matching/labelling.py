@@ -15,6 +15,7 @@ from ..cameras.camera import Camera
 from ..cameras.focal_planes import focal_planes
 from ..exceptions import AssumptionWarning, InputError, MatchError, reasons_of, some_of, warn
 from ..inputs import column_contract, repetitions
+from ..inputs.detector_files import with_ids_of
 from ..inputs.exposures import stated_numbers
 from ..measurement.flags import Flag, flags_of
 from ..runtime import parallel
@@ -102,6 +103,8 @@ def labelled(table, exposures, shape, camera, options):
             log.info("layout of the detectors by the headers, from which solve begins to find it: %s", camera)
         elif parts:
             camera = camera.with_headers(parts)
+        if camera is not None and camera.has_focal_plane:
+            table = with_ids_of(table, camera.detectors)
         found = _labelled_in(table, exposures, shape, camera, options)
         if not found.lost(_FEW, options.min_exposures):
             return found
