@@ -16,6 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from dataclasses import field as stored
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -187,15 +188,11 @@ class Camera(ShownAsPrinted):
         self._check_overlaps()
 
     def _check_overlaps(self):
-        keys = list(self.detectors)
-        for i, first in enumerate(keys):
-            for second in keys[i + 1 :]:
-                share = _overlap(self.detectors[first], self.detectors[second])
-                if share > OVERLAP:
-                    raise InputError(
-                        f"detectors {first} and {second} of camera {self.name} lie on each other by "
-                        f"{100 * share:.0f} % of their area: correct the layouts (focal plane -> undistorted pixels)"
-                    )
+        for (first, second), share in overlapping(self.detectors).items():
+            raise InputError(
+                f"detectors {first} and {second} of camera {self.name} lie on each other by "
+                f"{100 * share:.0f} % of their area: correct the layouts (focal plane -> undistorted pixels)"
+            )
 
     @classmethod
     def of_images(cls, shapes: Iterable[Shape]) -> Camera:
@@ -337,8 +334,13 @@ class Camera(ShownAsPrinted):
                 f"the table has no column detector, which of {', '.join(self.detectors)} of camera {self.name}: add it"
             )
         detector = np.asarray(table["detector"]).astype(str)
-        for key in np.unique(detector):
-            self[key]  # refuses an unknown one
+        keys = np.unique(detector).tolist()
+        if unknown := [key for key in keys if key not in self.detectors]:
+            raise InputError(
+                f"camera {self.name} has no detector {unknown[0]!r}; it has {', '.join(self.detectors)}, and the "
+                f"column detector has {', '.join(keys)}, not the same numbers each once: rename these in the column, "
+                "or give the camera of these detectors"
+            )
         return detector
 
     @plain_numbers
@@ -679,6 +681,12 @@ def _within(detector, field):
     size, outline = np.array(field[::-1]), detector.outline
     margin = MARGIN * size
     return bool(np.all(outline >= -margin - 0.5) and np.all(outline <= size + margin - 0.5))
+
+
+def overlapping(detectors):
+    """``{(id, id): part of the smaller}`` of ``{id: Detector}`` that lie on each other by more than `OVERLAP`."""
+    shares = {pair: _overlap(*(detectors[key] for key in pair)) for pair in combinations(detectors, 2)}
+    return {pair: share for pair, share in shares.items() if share > OVERLAP}
 
 
 def _overlap(first, second):

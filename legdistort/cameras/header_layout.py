@@ -1,7 +1,8 @@
 """Whether the headers have the detectors of a camera where it has them, and which detector they have elsewhere.
 
 Where all of them lie, and how large a pixel is, is no matter of a layout: both are compared after one similarity. That
-is the one of the detectors that agree on it, so that a detector whose header is wrong has no part in it.
+is the one of the detectors that agree on it, so that a detector whose header is wrong has no part in it. A header is
+wrong that has its detector elsewhere, turned, mirrored, or its pixels of another size than the others have theirs.
 """
 
 from dataclasses import dataclass
@@ -21,6 +22,12 @@ FAR = 20.0
 #: have nothing but shifts wrong, by a normal error, 1 to 3 % of cameras have one
 #: (`tests/cameras/test_odd_headers.py`).
 CHANCE = 4e-3
+#: Pixels of two detectors are of the same size by headers to this: distortions make up for so much.
+_SAME_SCALE = 1.01
+#: By less than this [deg, part] no detector is otherwise turned, or larger, for dithers: `legdistort.solve` finds that.
+ANGLE_SAME, SCALE_SAME = 3.0, 0.03
+#: A mirrored detector is not turned if it is by less than this [deg].
+_SAME_ANGLE = 0.1
 #: Pairs of detectors at most that are tried as those that agree.
 _MOST_PAIRS = 500
 
@@ -34,7 +41,10 @@ class HeaderLayout:
     names : tuple of str
         Detectors that are compared.
     stated, found : ndarray, shape (n, 4, 2)
-        Their corners where the headers and where the camera has them, each in its plane.
+        Their corners where the headers and where the camera has them, each in its plane; found without what each has of
+        a scale of its own.
+    own : ndarray, shape (n, 2, 3)
+        Similarity of each detector by itself from where the headers to where the camera has it.
     agree : ndarray of bool, shape (n,)
         Those by which the two planes are compared.
     """
@@ -42,6 +52,7 @@ class HeaderLayout:
     names: tuple
     stated: np.ndarray
     found: np.ndarray
+    own: np.ndarray
     agree: np.ndarray
 
     @cached_property
@@ -62,11 +73,23 @@ class HeaderLayout:
 
     @cached_property
     def rotations(self):
-        """Rotation of each detector by the headers less that which it has, as `Place.rotation`, degrees, (n,)."""
-        out = []
-        for stated, found in zip(similarity.apply(self.similarity, self.stated), self.found, strict=True):
-            out.append(similarity.describe(similarity.fit_similarity(stated, found, parity=1))["rotation"])
-        return np.array(out)
+        """Rotation of each detector by the headers less that which it has, as `Place.rotation`, degrees, (n,).
+
+        Of a mirrored one that which follows after its y is reversed.
+        """
+        steps = [similarity.compose(each, similarity.invert(self.similarity)) for each in self.own]
+        return np.array([similarity.describe(step)["rotation"] for step in steps])
+
+    @cached_property
+    def mirrored(self):
+        """Whether the header of each detector has it mirrored against those that agree, bool (n,)."""
+        return np.linalg.det(self.own[:, :, :2]) * np.linalg.det(self.similarity[:, :2]) < 0
+
+    @cached_property
+    def scales(self):
+        """Sizes of pixels by the headers over what they are, (n,); those that agree have 1 on average."""
+        logs = _log_scales(self.own)
+        return np.exp(logs - logs[self.agree].mean())
 
     @cached_property
     def errors(self):
@@ -95,9 +118,15 @@ class HeaderLayout:
         return float(2 * far[0] if len(self.names) == 2 else far.max())
 
     @property
+    def far(self):
+        """Largest distance [pix] by which an odd detector is off: its middle, or its corners by the scale alone."""
+        by_scale = np.abs(self.scales - 1) * _arms(self.found)
+        return float(np.max(np.maximum(np.hypot(*self.shifts.T), by_scale)[~self.agree], initial=0.0))
+
+    @property
     def is_undecided(self):
         """Whether headers disagree, and nothing shows which are wrong."""
-        return not self.odd and self.scatter > FAR
+        return not self.odd and (self.scatter > FAR or (len(self.names) == 2 and bool(_unlike(self.own).any())))
 
     def sentence(self, there):
         """What is wrong of the headers, in words; `there` is what has the detectors where they lie. Empty for nothing.
@@ -105,22 +134,52 @@ class HeaderLayout:
         ``"the stars put it"``, for example.
         """
         if self.is_undecided:
-            far = (
-                f"{self.scatter:.0f} px otherwise to each other than {there}, and nothing shows which of them is wrong"
-            )
+            far = f"{self.scatter:.0f} px otherwise to each other than {there}"
             if len(self.names) == 2:
-                return f"the headers of detectors {' and '.join(self.names)} have these {far}"
-            return f"the headers have the detectors up to {far}"
-        told = [
-            f"{name} {np.hypot(*shift):.0f} px ({shift[0]:+.0f} in x, {shift[1]:+.0f} in y of the focal plane"
-            f"{_told_error(off)}, turned by {angle:.2f}{_told_error(turn)} deg)"
-            for name, shift, angle, (off, turn), agrees in zip(
-                self.names, self.shifts, self.rotations, self.errors, self.agree, strict=True
-            )
-            if not agrees
-        ]
+                ratio = float(self.scales.max() / self.scales.min())
+                far += f", pixels of the one {ratio:.3f} times as large as those of the other" * (ratio > _SAME_SCALE)
+                far += ", the one mirrored against the other" * bool(self.mirrored.any())
+            known = f"{far}, and nothing shows which of them is wrong"
+            if len(self.names) == 2:
+                return f"the headers of detectors {' and '.join(self.names)} have these {known}"
+            return f"the headers have the detectors up to {known}"
+        told = [self._told(k) for k in np.flatnonzero(~self.agree)]
         others = f"the headers of the other {np.count_nonzero(self.agree)} agree to {self.scatter:.2g} px"
         return f"the headers have detector {', '.join(told)} from where {there}; {others}" if told else ""
+
+    def _told(self, k):
+        """How far off the header has one of the detectors, in words."""
+        (x, y), (off, turn), angle = self.shifts[k], self.errors[k], self.rotations[k]
+        larger = self.scales[k] if abs(self.scales[k] - 1) * _arms(self.found)[k] > LEAST else 1.0
+        words = orientation_in_words(angle, larger, mirrored=self.mirrored[k], error=_told_error(turn))
+        shift = f"({x:+.0f} in x, {y:+.0f} in y of the focal plane{_told_error(off)}, {words})"
+        return f"{self.names[k]} {np.hypot(x, y):.0f} px {shift}"
+
+
+def orientation_in_words(angle, scale, *, mirrored, error=""):
+    """How a header has a detector otherwise turned, or mirrored, or larger, than it is.
+
+    Parameters
+    ----------
+    angle : float
+        Degrees; of a mirrored one the rotation that follows after its y is reversed.
+    scale : float
+        Size of its pixels by the header over what it is.
+    mirrored : bool
+    error : str
+        That of the angle, in words.
+    """
+    larger = f"its pixels {scale:.3f} times as large as they are" if scale != 1 else ""
+    angle = abs(angle) if abs(angle) > 180 - _SAME_ANGLE / 10 else angle
+    words = f"turned by {angle:.2f}{error} deg"
+    if mirrored:
+        nearest = round(angle / 90) % 4
+        axes = "y reversed", "x and y exchanged", "x reversed", "x and y exchanged and both reversed"
+        rest = (angle - 90 * nearest + 180) % 360 - 180
+        words = f"mirrored, {axes[nearest]}" + (f", turned by {rest:.2f} deg" if abs(rest) > _SAME_ANGLE else "")
+    elif larger and abs(angle) < _SAME_ANGLE and not error:
+        return larger
+    return f"{words}, {larger}" if larger else words
 
 
 def _told_error(error):
@@ -131,7 +190,7 @@ def compare_headers(detectors):
     """The `HeaderLayout` of a camera; None if headers state nothing of it, or it has no place for two detectors.
 
     Detectors whose places nothing determined are not compared; if there are no others, places are where the layout
-    begins, and none contradicts another.
+    begins, and none contradicts another but one that is mirrored or turned, since dithers contradict its header.
 
     Parameters
     ----------
@@ -149,47 +208,106 @@ def compare_headers(detectors):
         layouts = [getattr(detectors[key], kind) for key in names]
         return np.array([similarity.apply(similarity.invert(a), xy) for a, xy in zip(layouts, corners, strict=True)])
 
-    stated = places("header_layout")
-    found = _rigid(stated, places("layout"))
-    agree = _agreeing(stated, found) if len(known) > 1 else np.ones(len(names), dtype=bool)
-    return HeaderLayout(tuple(names), stated, found, agree)
+    stated, lie = places("header_layout"), places("layout")
+    own = np.array([_fitted(stated, lie, [k]) for k in range(len(stated))])
+    found = _rigid(stated, lie, own)
+    agree = _agreeing(stated, found, own) if len(known) > 1 else ~_otherwise_turned(own)
+    return HeaderLayout(tuple(names), stated, found, own, agree)
 
 
-def _rigid(stated, found):
+def _rigid(stated, found, own):
     """Corners (n, 4, 2) where they were found, of detectors as headers have them but for place, rotation, common scale.
 
     What else there is of a layout, headers know nothing of, and exposures determine the least.
     """
-    own = np.array([_fitted(stated, found, [k]) for k in range(len(stated))])
-    scales = np.sqrt(np.abs(np.linalg.det(own[:, :, :2])))
-    own[:, :, :2] *= (np.exp(np.log(scales).mean()) / scales)[:, None, None]
+    logs = _log_scales(own)
+    turns = own[:, :, :2] * np.exp(logs - np.median(logs))[:, None, None]  # one that is wrong has no part in it
     offsets = stated - stated.mean(axis=1, keepdims=True)
-    return found.mean(axis=1, keepdims=True) + offsets @ own[:, :, :2].mT
+    return found.mean(axis=1, keepdims=True) + offsets @ turns.mT
 
 
 def _fitted(stated, found, rows):
     return similarity.fit_similarity(stated[rows].reshape(-1, 2), found[rows].reshape(-1, 2))
 
 
-def _agreeing(stated, found):
-    """Detectors (n,) that agree on a similarity: most of them, and all others that chance does not exclude."""
+def _log_scales(own):
+    """Logarithms (n,) of the sizes of pixels by headers over those that they have, by similarities (n, 2, 3)."""
+    return -np.log(np.abs(np.linalg.det(own[:, :, :2]))) / 2
+
+
+def _arms(corners):
+    """Distance (n,) of the corners (n, 4, 2) of each detector from its middle, rms."""
+    return np.sqrt(np.mean(np.sum((corners - corners.mean(axis=1, keepdims=True)) ** 2, axis=2), axis=1))
+
+
+def _unlike(own):
+    """Detectors (n,) that are mirrored against most, or against the first, or have pixels of another size than most."""
+    parity, logs = np.sign(np.linalg.det(own[:, :, :2])), _log_scales(own)
+    scale = np.abs(logs - np.median(logs)) > np.log(_SAME_SCALE)
+    return (parity != np.sign(parity.sum() or parity[0])) | scale
+
+
+def _otherwise_turned(own):
+    """Detectors (n,) of layouts to begin with that are not as headers have them since dithers contradict these.
+
+    Where they are is no matter of it: these shifts are not known.
+    """
+    turn = own[:, :, :2]
+    parity, logs = np.linalg.det(turn) > 0, _log_scales(own)
+    angle = np.degrees(np.arctan2(turn[:, 1, 0], turn[:, 0, 0]))
+    like = [
+        (parity == parity[k])
+        & (np.abs(logs - logs[k]) < np.log(1 + SCALE_SAME))
+        & (np.abs((angle - angle[k] + 180) % 360 - 180) < ANGLE_SAME)
+        for k in range(len(own))
+    ]
+    return ~max(like, key=np.count_nonzero)
+
+
+def _agreeing(stated, found, own):
+    """Detectors (n,) that agree on a similarity: most of them, and all others that chance does not exclude.
+
+    A mirrored one does not, nor one whose pixels are not of the size that those of the others have.
+    """
     n = len(stated)
     if n == 2:
         return np.ones(2, dtype=bool)
+    parity, logs = np.linalg.det(own[:, :, :2]) > 0, _log_scales(own)
+    alike = parity == (2 * np.count_nonzero(parity) >= n)
+    rows, arm = np.flatnonzero(alike), _arms(found)
+    if len(rows) > 2:
+        scale = _like_most(len(rows), lambda some: (arm * (logs - logs[rows[some]].mean()))[rows] ** 2, n_values=1)
+        rows = rows[scale]
 
-    def off(rows):
-        left = similarity.apply(_fitted(stated, found, rows), stated) - found
+    def off(some):
+        left = similarity.apply(_fitted(stated, found, rows[some]), stated[rows]) - found[rows]
         return np.sum(left**2, axis=2).mean(axis=1)
 
+    if len(rows) > 2:
+        rows = rows[_like_most(len(rows), off, n_values=2)]
+    return np.isin(np.arange(n), rows)
+
+
+def _like_most(n, off, n_values):
+    """Which of n detectors agree: most of them, and all others that chance does not exclude, bool (n,).
+
+    Parameters
+    ----------
+    n : int
+    off : callable
+        ``off(rows)``: squares (n,) [pix^2] of what all are off if those of the rows are right.
+    n_values : int
+        Numbers of each detector that are compared.
+    """
     most, pairs = n // 2 + 1, list(combinations(range(n), 2))
     tried = [off(list(pair)) for pair in pairs[:: len(pairs) // _MOST_PAIRS + 1]]
     order = np.argsort(min(tried, key=lambda left: np.sort(left)[:most].sum()))
     good = np.isin(np.arange(n), order[:most])
     while not good.all():
-        left, dof = off(np.flatnonzero(good)), 2 * np.count_nonzero(good) - 2
+        left, dof = off(np.flatnonzero(good)), n_values * (np.count_nonzero(good) - 1)
         k = np.flatnonzero(~good)[np.argmin(left[~good])]
-        ratio = left[k] / 2 / max(left[good].sum() / dof, 1e-12)
-        if left[k] > LEAST**2 and special.fdtrc(2, dof, ratio) < CHANCE / n:
+        ratio = left[k] / n_values / max(left[good].sum() / dof, 1e-12)
+        if left[k] > LEAST**2 and special.fdtrc(n_values, dof, ratio) < CHANCE / n:
             break
         good[k] = True
     return good

@@ -15,6 +15,7 @@ from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry import basis, detector_modes, similarity
 from ..geometry.distortion import Distortion
 from ..inputs import column_contract
+from ..inputs.detector_files import with_ids_of
 from .detector import moved_by
 from .stated_errors import FREE, StaticSpread, as_widths, resized
 
@@ -31,6 +32,7 @@ def correct_table(camera, table, sigma=None, rest=None):
     table = column_contract.check(table, column_contract.MEASURED if known else column_contract.LISTED, "the list")
     if not (camera.has_focal_plane or camera.states_static):
         raise InputError(f"camera {camera.name} states no static distortion: there is nothing to correct with it")
+    table = with_ids_of(table, camera.detectors) if camera.has_focal_plane else table
     detector = _detectors(camera, table)
     xy = np.column_stack([table[name].to_value(u.pix) for name in "xy"])
     measured = column_contract.covariance(table) if known else np.zeros((len(xy), 2, 2))

@@ -9,6 +9,8 @@ import logging
 import re
 from dataclasses import replace
 
+import numpy as np
+
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry import epochs
 from .exposure_names import alike, detector_name
@@ -22,8 +24,8 @@ _OF_FILES = ("CCDCHIP", "DETECTOR", "CHIP", "CCDNUM", "DET-ID")
 _IN_NAME = re.compile(
     r"(?<![A-Za-z0-9])(nrc[ab](?:[1-4]|long)|nrs[12]|wfi\d\d|(?:chip|ccd|det|sca)\d{1,3})(?![A-Za-z0-9])", re.IGNORECASE
 )
-#: The number of a detector.
-_NUMBER = re.compile(r"\D*?0*(\d+)")
+#: The number of a detector: the last one in its name.
+_NUMBER = re.compile(r".*?0*(\d+)\D*")
 #: Years between the beginnings of what counts as one exposure: 2 s by name, a minute by the time alone.
 _APART, _SAME_TIME = 60 / 3.156e7, 2 / 3.156e7
 
@@ -226,18 +228,40 @@ def _by_number(exposures, known):
         if exposure.detector is not None:
             called.setdefault(exposure.detector, set()).add(_key_of(exposure.header, known))
     named = {key for keys in called.values() for key in keys} - {None}
-    if set(called) & set(known.values()) or len(named) == len(called):
+    if len(named) == len(called):
         return {}
-    theirs, ours = (
-        {match[1]: key for key in keys if (match := _NUMBER.fullmatch(key))} for keys in (called, known.values())
+    return paired_by_number(called, known.values())
+
+
+def paired_by_number(theirs, ours):
+    """``{id: id}`` of ids of detectors that have other names and the same numbers, each once, all of them; else empty.
+
+    It is logged.
+    """
+    if not theirs or set(theirs) & set(ours):
+        return {}
+    numbers, of_camera = (
+        {match[1]: key for key in keys if (match := _NUMBER.fullmatch(key))} for keys in (theirs, ours)
     )
-    if not called or theirs.keys() != ours.keys() or not len(called) == len(theirs) == len(known):
+    if numbers.keys() != of_camera.keys() or not len(theirs) == len(numbers) == len(ours):
         return {}
-    pairs = {theirs[number]: ours[number] for number in sorted(theirs, key=int)}
+    pairs = {numbers[number]: of_camera[number] for number in sorted(numbers, key=int)}
     log.info(
         "detectors %s are taken for %s of the camera, by their numbers", ", ".join(pairs), ", ".join(pairs.values())
     )
     return pairs
+
+
+def with_ids_of(table, ids):
+    """A table with the ids of a camera in the column ``detector`` in place of others of the same numbers, if so."""
+    if "detector" not in table.colnames:
+        return table
+    named = np.asarray(table["detector"]).astype(str)
+    pairs = paired_by_number(np.unique(named).tolist(), list(ids))
+    if pairs:
+        table = table.copy()
+        table["detector"] = [pairs[key] for key in named]
+    return table
 
 
 def stated_detector(header):

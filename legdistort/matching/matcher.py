@@ -9,37 +9,28 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy import units as u
-from astropy.table import vstack
 
 from ..cameras import ties
 from ..cameras.camera import Camera, check_camera
 from ..cameras.exchanged import check_places
-from ..cameras.focal_planes import focal_planes
-from ..exceptions import AssumptionWarning, InputError, MatchError, reasons_of, some_of, warn
+from ..exceptions import InputError, MatchError, reasons_of
 from ..geometry.epochs import header_epoch, mean_epoch
 from ..geometry.zenith import stated_zenith
-from ..inputs import column_contract, repetitions
+from ..inputs import column_contract
 from ..inputs.column_contract import colour_column
 from ..inputs.exposure_files import ExposureFile, listed
 from ..inputs.exposure_names import whole_name
-from ..inputs.exposures import Exposure, stated_numbers
+from ..inputs.exposures import Exposure
 from ..inputs.star_lists.bad_places import without_bad_places
 from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
-from ..measurement.flags import UNUSABLE, Flag, flags_of
+from ..measurement.flags import UNUSABLE
 from ..priors.from_headers import describe, header_distortions
-from ..runtime import parallel
 from ..runtime.guards.units import plain_numbers
-from . import detector_layout, detector_places
-from .exposure_groups import interlink, link, standing, unite, without
-from .fields import apart
-from .header_poses import HeaderPoses
-from .lattices.identification import identify_holes
-from .lattices.periods import warn_of_lattice
-from .matches import Matches, in_focal_plane, shapes_by_exposure
-from .options import MatchOptions, check_enough
-from .star_labels import label_stars
-from .star_lists import StarList
+from .detectors import detector_layout
+from .labelling import add_numbers, labelled
+from .matches import Matches
+from .options import MatchOptions
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -48,15 +39,6 @@ if TYPE_CHECKING:
     from ..runtime.annotations import Shape, StrPath
 
 log = logging.getLogger(__name__)
-
-#: Fewest detections with which an exposure can take part.
-FEWEST = 5
-#: With a smaller part of hot pixels among the detections of every exposure these are not linked anew without them.
-FEW_HOT = 0.05
-#: How often detectors are placed by the stars that were found with the placing before.
-_MOST_PLACINGS = 4
-#: Detections that a layout must gain in which detectors lie elsewhere than in an exact one.
-_FEWEST_GAINED = 10
 
 
 @plain_numbers
@@ -160,122 +142,30 @@ def match(
     table = column_contract.check(detections, column_contract.DETECTED, "the table of detections")
     exposures = None if exposures is None else listed(exposures, "match")
     table = without_bad_places(table, exposures or ())
-    if camera is None:
-        if detector_layout.is_needed(table, exposures):
-            if start is not None:
-                raise InputError(
-                    "start positions are those of whole exposures, and how the detectors of these lie to each other is "
-                    "not known: give the camera too, camera= (--camera)"
-                )
-            shapes = detector_layout.shapes_of(table, exposures, shape)
-            log.info("neither a camera nor headers: how the detectors lie is sought in the dithers")
-            _add_stated(table, {whole_name(exposure): exposure for exposure in exposures or ()}, options.keywords)
-            again = vars(replace(options, columns=None))
-            return detector_layout.match_parts(table, shapes, lambda parts, shape: match(parts, shape=shape, **again))
-        if any(exposure.detector is not None for exposure in exposures or ()):
-            camera = Camera.of_frames(exposures)
-            log.info("layout of the detectors by the headers, from which solve begins to find it: %s", camera)
-    elif any(exposure.detector is not None for exposure in exposures or ()):
-        camera = camera.with_headers(exposures)
-    if camera is not None:
-        table = in_focal_plane(table, camera)
-        shape = camera.field
-        exposures = None if exposures is None else focal_planes(camera, exposures)
-    named = None if exposures is None else {e.name: e for e in exposures}
-    _add_numbers(table, named or {}, options.keywords)
-    names = list(dict.fromkeys(table["exposure"].tolist()) if named is None else named)
-    _check_names(table, names, min_exposures)
-    shapes = _shapes(table, names, named, shape)
-    edges = _at_edges(table, int(reject_flags))
-    table = _without_repetitions(_without_flagged(table, int(reject_flags)))
-    copies = _copies(table)
-    table, names = table[~np.isin(table["exposure"], list(copies))], [name for name in names if name not in copies]
-    headers = HeaderPoses.of((named or {}).values(), shapes, _known_starts(options.start, shapes))
-
-    with parallel.one_blas_thread():  # matrices are small
-        if camera is not None and len(camera.detectors) > 1 and len(names) > 1:
-            star, left_out = _label_over_gaps(table, names, shapes, headers, options, camera, edges)
-        else:
-            star, left_out = _label(table, names, shapes, headers, options, camera)
+    if camera is None and detector_layout.is_needed(table, exposures):
+        if start is not None:
+            raise InputError(
+                "start positions are those of whole exposures, and how the detectors of these lie to each other is "
+                "not known: give the camera too, camera= (--camera)"
+            )
+        shapes = detector_layout.shapes_of(table, exposures, shape)
+        log.info("neither a camera nor headers: how the detectors lie is sought in the dithers")
+        _add_stated(table, {whole_name(exposure): exposure for exposure in exposures or ()}, options.keywords)
+        again = vars(replace(options, columns=None))
+        return detector_layout.match_parts(table, shapes, lambda parts, shape: match(parts, shape=shape, **again))
+    found = labelled(table, exposures, shape, camera, options)
+    camera, named, shapes, left_out = found.camera, found.named, found.shapes, found.left_out
+    table, star, several = found.table, found.star, len(found.names) > 1
     star[~_isolated(table, isolation)] = -1
-    if camera is not None and len(names) > 1:
+    if camera is not None and several:
         _check_detectors(camera, table, star, shapes)
-    tying = None if camera is None or len(names) == 1 else _ties_of_few(camera, table, star, min_exposures)
-    table, star = _keep_common(table, star, 1 if len(names) == 1 else min_exposures, left_out, tying, tell=True)
+    tying = _ties_of_few(camera, table, star, min_exposures) if camera is not None and several else None
+    table, star = _keep_common(table, star, min_exposures if several else 1, left_out, tying, tell=True)
     epoch = mean_epoch(e.header for e in named.values()) if named else None
     _add_stated(table, named or {})
     distortions = header_distortions(named[name] for name in np.unique(table["exposure"])) if named else {}
-    matches = _finish(table, star, shapes, headers, left_out, epoch, distortions)
-    return replace(matches, left_out=copies | left_out, camera=camera)
-
-
-def _label(table, names, shapes, headers, options, camera=None):
-    """Number of the star of every detection, -1 for none, and exposures that are left out, with the reason."""
-    rows = {name: np.flatnonzero(table["exposure"] == name) for name in names}
-    left_out = {n: f"only {len(r)} usable detections of at least {FEWEST}" for n, r in rows.items() if len(r) < FEWEST}
-    kept = [name for name in names if name not in left_out]
-    lists = [_star_list(table[rows[name]], shapes[name]) for name in kept]
-    star = np.full(len(table), -1)
-    if len(names) == 1 and kept:
-        log.info(
-            "one exposure (%s): every detection is a star; a solution that it comes into (--base), or a reference "
-            "catalogue, solves it",
-            names[0],
-        )
-        star[:] = np.arange(len(table))
-        return star, left_out
-    found = identify_holes(lists, kept, headers, left_out, gaps=len(camera.detectors) > 1 if camera else False)
-    if found is None:
-        found = _associate(lists, kept, headers, left_out, options)
-    for name, labels in found.items():
-        star[rows[name]] = labels
-    return star, left_out
-
-
-def _label_over_gaps(table, names, shapes, headers, options, camera, edges):
-    """The same in the layout which the stars call for: labels, with a warning where that of the camera is exact.
-
-    It is sought anew with the stars that were found, as long as more detections become the same star; of an exact one
-    by more than chance. Stars that cross are at the `edges`: a table of detections for this search alone.
-    """
-    keys, free = list(camera.detectors), detector_places.is_free(camera)
-    rows, moved = len(table), vstack([table, edges[np.isin(edges["exposure"], names)]], metadata_conflicts="silent")
-    detector = np.array([keys.index(key) for key in camera.ids(moved)])
-    exposure, given = np.unique(moved["exposure"], return_inverse=True)[1], _positions(moved)
-    flux = column_contract.values(moved, "flux") if "flux" in moved.colnames else None
-    found, alone = _label(table, names, shapes, headers, options), np.full(len(moved) - rows, -1)
-    for _ in range(_MOST_PLACINGS):
-        star = np.concatenate([found[0], alone])
-        xy = detector_places.nearer(camera, _positions(moved), exposure, detector, star, flux)
-        if xy is None:
-            break
-        c, far = detector_places.farthest(xy - given, detector)
-        if not free and far < detector_places.WIDTH:
-            break
-        moved["x"], moved["y"] = xy.T * u.pix
-        try:
-            again = _label(moved[:rows], names, shapes, headers, options)
-        except MatchError:
-            break
-        gained = detector_places.n_tied(again[0]) - detector_places.n_tied(found[0])
-        if gained <= (0 if free else _FEWEST_GAINED):
-            break
-        found = again
-        if not free:
-            warn(
-                f"stars that move over the gaps do not fit the layout of camera {camera.name}: detector {keys[c]} "
-                f"seems to lie {far:.0f} px from where it has it; they are matched nevertheless, and layout='fit' "
-                "(--layout fit) of solve and run finds the layout",
-                AssumptionWarning,
-            )
-            break
-    star = np.concatenate([found[0], alone])
-    return detector_places.with_crossing(camera, _positions(moved), exposure, detector, star, flux)[:rows], found[1]
-
-
-def _positions(table):
-    """Positions (n, 2) of a table, pixels."""
-    return np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
+    matches = _finish(table, star, shapes, found.headers, left_out, epoch, distortions)
+    return replace(matches, left_out=found.copies | left_out, camera=camera)
 
 
 def _check_detectors(camera, table, star, shapes):
@@ -292,26 +182,13 @@ def _check_measured(detections):
         raise InputError("match takes the table that measure makes of exposures: call match(measure(exposures))")
 
 
-def _add_numbers(table, named, keywords):
-    """Add a column for every keyword with a number in the headers of exposures, if the table has none of that name."""
-    lacking = [keyword for keyword in keywords or () if keyword not in table.colnames]
-    if lacking and not named:
-        raise InputError(
-            f"keywords: {lacking[0]} is to be read from headers, and there are no frames: give them, exposures= "
-            "(--wcs FRAME ...), or a column of that name"
-        )
-    headers = {name: exposure.header for name, exposure in named.items()}
-    for keyword, numbers in stated_numbers(headers, lacking).items():
-        table[keyword] = [numbers.get(name, np.nan) for name in table["exposure"]]
-
-
 def _add_stated(table, named, keywords=None):
     """Add the column ``epoch`` [yr] if headers state it and the table does not; NaN where one does not.
 
     Also ``tan_z`` and ``parallactic_angle`` [deg], as refraction needs them; from place, time and site for stars with
     colours alone.
     """
-    _add_numbers(table, named, keywords)
+    add_numbers(table, named, keywords)
     epochs = {name: header_epoch(exposure.header) for name, exposure in named.items()}
     if any(epoch is not None for epoch in epochs.values()) and "epoch" not in table.colnames:
         years = {name: np.nan if epoch is None else epoch for name, epoch in epochs.items()}
@@ -331,144 +208,6 @@ def _isolated(table, limit):
         why = "" if "crowding" in table.colnames else " (flagged as blended in their lists; --isolation inf keeps them)"
         log.info("%d of %d detections are not isolated and left out%s", np.count_nonzero(~isolated), len(table), why)
     return isolated
-
-
-def _without_flagged(table, reject_flags):
-    """The table without rows of which a flag is to be rejected; a missing flag is none."""
-    if "flags" not in table.colnames:
-        return table
-    flags = flags_of(table)
-    good = (flags & reject_flags) == 0
-    counts = {flag.name: np.count_nonzero(flags & flag) for flag in Flag if flag & reject_flags}
-    named = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
-    if not good.all() and "crowding" not in table.colnames:  # what measure flags is in its own table
-        n = np.count_nonzero(~good)
-        log.info("%d of %d detections are left out for their flags (%s)", n, len(table), named)
-    if not good.any():
-        raise MatchError(
-            f"none of the {len(table)} detections can be used, all have flags for which they are rejected ({named}): "
-            "correct the column flags or leave it out, or give the bits to reject, match(reject_flags=...), 0 for none"
-        )
-    return table[good]
-
-
-def _at_edges(table, reject_flags):
-    """Detections at the edge of an image that are rejected for no other reason."""
-    if "flags" not in table.colnames:
-        return table[:0]
-    return table[(flags_of(table) & reject_flags) == Flag.EDGE]
-
-
-def _without_repetitions(table):
-    """The table without rows that repeat a position of the same exposure: they would pass for two blended stars."""
-    place = np.rec.fromarrays([table["exposure"], table["x"].value, table["y"].value])
-    first = np.sort(np.unique(place, return_index=True)[1])
-    if len(first) < len(table):
-        log.warning("%d detections stand twice at the very same place; one of each is kept", len(table) - len(first))
-    return table[first]
-
-
-def _known_starts(start, shapes):
-    """Start positions of exposures that there are."""
-    unknown = sorted(set(start or ()) - set(shapes))
-    if unknown:
-        raise InputError(
-            f"start has exposure {unknown[0]}, which is none of those of the table: {some_of(sorted(shapes), 6)}"
-        )
-    return start
-
-
-def _copies(table):
-    """Exposures that repeat another one, ``{name: reason}``."""
-    names, exposure = np.unique(table["exposure"], return_inverse=True)
-    xy = np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
-    return repetitions.reasons([str(name) for name in names], exposure, xy)
-
-
-def _check_names(table, names, min_exposures):
-    unknown = sorted(set(table["exposure"].tolist()) - set(names))
-    if unknown:
-        raise InputError(
-            f"the table of detections names exposure {unknown[0]!r}, which is not among exposures= ({', '.join(names)})"
-        )
-    if len(names) > 1:
-        check_enough(len(names), min_exposures)
-
-
-def _shapes(table, names, named, shape):
-    if named is not None:
-        return {name: named[name].shape for name in names}
-    if shape is None:
-        shape = tuple(int(np.ceil(table[c].to_value(u.pix).max() + 0.5)) for c in ("y", "x"))
-        warn(
-            f"no shape given: every exposure is taken as {shape[1]} x {shape[0]} pixels, the extent of the positions; "
-            "give shape=(ny, nx) or exposures= (--shape NY NX)",
-            AssumptionWarning,
-        )
-    return shapes_by_exposure(shape, names)
-
-
-def _star_list(table, shape):
-    x, y, x_err, y_err = (table[c].to_value(u.pix) for c in ("x", "y", "x_err", "y_err"))
-    has_flux = "flux" in table.colnames
-    flux = np.nan_to_num(column_contract.values(table, "flux"), nan=-np.inf) if has_flux else None
-    return StarList(np.column_stack([x, y]), np.hypot(x_err, y_err), shape, flux)
-
-
-def _associate(lists, names, headers, left_out, options):
-    """Star labels by exposure name; exposures without a place are added to `left_out`."""
-    if len(lists) < 2:
-        raise MatchError(f"fewer than two exposures have stars enough: {reasons_of(left_out)}")
-
-    tolerance, progress = options.tolerance, options.progress
-
-    def guess(i, j):
-        return headers.step(names[i], names[j])
-
-    def grouped(lists):
-        return unite(lists, link(lists, guess, tolerance=tolerance, progress=progress), guess, tolerance=tolerance)
-
-    groups = grouped(lists)
-    hot = standing(lists, groups[0])
-    if any(h.any() for h in hot):
-        log.info(
-            "%d detections stand still while the sky moves: hot pixels or bad columns, not used",
-            sum(h.sum() for h in hot),
-        )
-        lists = [stars.subset(~h) for stars, h in zip(lists, hot, strict=True)]
-        few = max(h.mean() for h in hot) < FEW_HOT  # they have not led the registrations astray
-        groups = [without(group, hot) for group in groups] if few else grouped(lists)
-    _check_groups(groups, lists, names, left_out, tolerance)
-    warn_of_lattice(lists, names, groups[0].poses, headers)
-    registrations, misfits = interlink(lists, groups[0], tolerance=tolerance, progress=progress)
-    left_out.update({names[i]: reason for i, reason in misfits.items()})
-    good = {pair: r for pair, r in registrations.items() if not misfits.keys() & set(pair)}
-    log.info("%d pairs of exposures registered", len(good))
-    labels = [np.full(len(h), -1) for h in hot]
-    for label, h, found in zip(labels, hot, label_stars([len(stars) for stars in lists], good), strict=True):
-        label[~h] = found
-    return dict(zip(names, labels, strict=True))
-
-
-def _check_groups(groups, lists, names, left_out, tolerance):
-    for group in groups:
-        if len(group.poses) == 1:
-            (only,) = group.poses
-            left_out[names[only]] = f"none of its {len(lists[only])} detections fit other exposures better than chance"
-    large = [sorted(names[i] for i in group.poses) for group in groups if len(group.poses) > 1]
-    if len(large) > 1:
-        raise apart(large, "match each group by itself; fields of one camera can be solved together then")
-    if not large:
-        message = (
-            f"no two exposures show the same stars (tried {some_of(names, 6)}); check that they overlap and that the "
-        )
-        message += "detections are stars"
-        if tolerance is not None:
-            message += (
-                f"; tolerance={tolerance:g} (--tolerance) is no reach of the search, but how far one star may lie "
-            )
-            message += "apart: leave it out, it is found"
-        raise MatchError(message)
 
 
 def _ties_of_few(camera, table, star, min_exposures):

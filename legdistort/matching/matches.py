@@ -18,6 +18,7 @@ from ..geometry import similarity
 from ..geometry.epochs import exposure_years
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract, exposure_names, repetitions, start_poses
+from ..inputs.detector_files import with_ids_of
 from ..results.errors.header_pointing import HeaderPointing
 from ..runtime.checks import check_choice
 from ..runtime.guards.units import plain_numbers
@@ -685,6 +686,7 @@ def in_focal_plane(table, camera, *, former=None):
     if "x_detector" in table.colnames and former not in (None, camera.to_meta()):
         return camera.in_focal_plane(Camera.from_meta(former).on_detectors(table))
     if "x_detector" not in table.colnames:
+        table = with_ids_of(table, camera.detectors)
         detector, part = camera.ids(table), QTable(table, copy=False)
         if "star" not in table.colnames:
             part["star"] = np.arange(len(table))

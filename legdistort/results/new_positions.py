@@ -21,6 +21,7 @@ from ..geometry import basis, similarity
 from ..geometry.epochs import year
 from ..geometry.models import like, to_pixels
 from ..inputs import column_contract
+from ..inputs.detector_files import with_ids_of
 from .errors import absolute_errors, common_maps
 from .motions import fitted
 
@@ -297,7 +298,8 @@ def widened_all(motion, degree):
 def correct_table(solution, table, epoch=None):
     """`Solution.correct_table`; see there."""
     table = column_contract.check(*_with_law(solution.diagnostics.error_law, table))
-    table = solution.camera.in_focal_plane(table)
+    camera = solution.camera
+    table = camera.in_focal_plane(with_ids_of(table, camera.detectors) if camera.has_focal_plane else table)
     if epoch is not None:
         fitted(solution.estimate.motions)
     if epoch is not None and "star" not in table.colnames:

@@ -76,6 +76,53 @@ def test_errors_of_how_far_it_is_off_are_those_of_drawn_headers(n_x, n_y):
     assert np.isnan(camera(3, 1, [(0, 0, 0), (0, 0, 0), ODD]).headers.errors).all()
 
 
+def spoilt(made, key, matrix):
+    """The camera with the header of a detector as if its pixels were first multiplied by `matrix` about the middle."""
+    layout, middle = made[key].header_layout, np.full(2, (SIZE - 1) / 2)
+    back = np.linalg.inv(matrix)
+    wrong = np.column_stack([back @ layout[:, :2], back @ (layout[:, 2] - middle) + middle])
+    return replace(made, detectors={**made.detectors, key: replace(made[key], header_layout=wrong)})
+
+
+@pytest.mark.parametrize(
+    ("matrix", "words"),
+    [
+        (1.02 * np.eye(2), r"turned by -?0.0\d \+- \S+ deg, its pixels 1.020 times as large as they are"),
+        (np.diag([-1, 1]), "mirrored, x reversed"),
+        (np.diag([1, -1]), "mirrored, y reversed"),
+        (np.array([[0, 1], [1, 0]]), "mirrored, x and y exchanged"),
+        (-np.eye(2), r"turned by -?1(?:80.0|79.9)\d \+- \S+ deg"),
+        (1.2 * turned(-10.0), r"turned by 10.0\d \+- \S+ deg, its pixels 1.200 times as large as they are"),
+    ],
+    ids=["2 %", "x", "y", "xy", "180", "20 % and 10 deg"],
+)
+def test_what_is_wrong_of_a_header_is_told(matrix, words):
+    """The others agree to a pixel and 0.02 degrees."""
+    wrong = np.random.default_rng(3).normal(0, [0.5, 0.5, 0.01], (4, 3))
+    headers = spoilt(camera(2, 2, wrong), "2", matrix).headers
+    assert headers.odd == ("2",)
+    assert re.search(rf"detector 2 \d px \(.*{words}\) from where the stars", headers.sentence("the stars put it"))
+    np.testing.assert_allclose(headers.shifts, wrong[:, :2] - wrong[[0, 1, 3], :2].mean(axis=0), atol=1.0)
+
+
+def test_scales_that_differ_all_over_the_field_contradict_nothing():
+    """Those of one chip by 1 %, of two others by half of it: a distortion that headers do not have."""
+    made = camera(2, 2, np.zeros((4, 3)))
+    for key, scale in (("1", 1.005), ("2", 1.005), ("3", 1.01)):
+        made = spoilt(made, key, scale * np.eye(2))
+    assert made.headers.odd == ()
+
+
+@pytest.mark.parametrize(
+    ("matrix", "words"),
+    [(1.03 * np.eye(2), "pixels of the one 1.030 times as large"), (np.diag([1, -1]), "the one mirrored against")],
+)
+def test_of_two_nobody_can_say_which_has_its_pixels_wrong(matrix, words):
+    headers = spoilt(camera(2, 1, np.zeros((2, 3))), "1", matrix).headers
+    assert headers.is_undecided
+    assert words in headers.sentence("the stars have them")
+
+
 def test_two_odd_ones_of_nine():
     wrong = np.random.default_rng(1).normal(0, [1, 1, 0.1], (9, 3))
     wrong[[3, 7], 0] += 40.0

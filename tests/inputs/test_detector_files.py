@@ -12,7 +12,7 @@ from astropy import units as u
 from astropy.coordinates import ICRS
 from astropy.io import fits
 from astropy.modeling import models
-from astropy.table import QTable
+from astropy.table import QTable, Table
 from gwcs import coordinate_frames as cf
 from scamp_heads import write_head
 
@@ -148,7 +148,7 @@ DITHERS = np.array([[0, 0], [5, 1], [-5, 2], [2, -4], [-3, -5], [4, 5.0]])
 
 
 def nominal_wcs(key, dither):
-    """As a pipeline has it: detector -> v2v3 -> world."""
+    """As a pipeline has it: detector -> v2v3 -> worlegdistort."""
     middle = models.Shift(-(N - 1) / 2) & models.Shift(-(N - 1) / 2)
     first = middle | models.AffineTransformation2D(SCALE * np.eye(2), translation=PLACES[key] + dither)
     sky = (
@@ -358,3 +358,35 @@ def test_lists_are_named_after_their_frames_whatever_they_end_with(visit, tmp_pa
     shutil.copy(first, "other.ecsv")
     assert main(["match", "other.ecsv", "--wcs", *files, "--error", "0.01", "--out", "m.ecsv"]) == 1
     assert "other.ecsv: exposure other is none of the frames" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("theirs", "ours"), [("IM{}", "{}"), ("{}", "IM{}"), ("{}", "H2RG-{}")])
+def test_lists_of_detectors_of_the_same_numbers_are_of_the_camera(theirs, ours, caplog):
+    """As frames are; whether the same stars are numbered or not, or a camera corrects them."""
+    caplog.set_level("INFO", logger="legdistort")
+    rng, keys = np.random.default_rng(1), (1, 2)
+    seen = [(f"e{i}", k, s) for k in keys for i in (0, 1) for s in range(4)]
+    rows = [(name, theirs.format(k), *rng.uniform(10, 90, 2), 0.1, 0.1, 4 * k + s) for name, k, s in seen]
+    table = Table(rows=rows, names=["exposure", "detector", "x", "y", "x_err", "y_err", "star"])
+    layouts = {k: np.array([[1.0, 0, -110 * (k - 1)], [0, 1, 0]]) for k in (2, 1)}
+    detectors = {ours.format(k): legdistort.Detector((100, 100), layout=each) for k, each in layouts.items()}
+    camera = legdistort.Camera("two", detectors)
+    matches = legdistort.Matches.from_table(table, camera=camera)
+    assert set(matches.table["detector"]) == {ours.format(k) for k in keys}
+    is_2 = np.asarray(table["detector"]) == theirs.format(2)
+    right = np.asarray(table["x"]) + np.where(is_2, 110, 0)
+    np.testing.assert_allclose(np.sort(matches.table["x"].value), np.sort(right), atol=1e-9)
+    np.testing.assert_allclose(camera.correct_table(table["detector", "x", "y"])["x"].value, right, atol=1e-9)
+    assert any("are taken for" in text for text in caplog.messages)
+
+
+@pytest.mark.parametrize("keys", ["13", "AB", "123"])
+def test_lists_of_other_detectors_are_refused_in_words(keys):
+    """Both sets, and the column to rename."""
+    table = Table({"exposure": ["e0"] * len(keys), "detector": list(keys)} | dict.fromkeys("xy", [5.0] * len(keys)))
+    table["x_err"] = table["y_err"] = 0.1
+    detector = {k: legdistort.Detector((100, 100), layout=np.array([[1.0, 0, -110 * k], [0, 1, 0]])) for k in (0, 1)}
+    camera = legdistort.Camera("two", {f"IM{k + 1}": each for k, each in detector.items()})
+    words = f"it has IM1, IM2, and the column detector has {', '.join(keys)}, .* rename these in the column"
+    with pytest.raises(InputError, match=words):
+        legdistort.match(table, camera=camera, min_exposures=2)

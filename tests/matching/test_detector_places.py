@@ -8,7 +8,7 @@ import pytest
 
 import legdistort
 from legdistort.exceptions import AssumptionWarning
-from legdistort.matching import detector_places
+from legdistort.matching.detectors import detector_places
 from legdistort.measurement.flags import Flag
 
 

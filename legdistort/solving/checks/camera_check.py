@@ -9,7 +9,7 @@ from ...cameras import ties
 from ...cameras.header_layout import FAR, LEAST, compare_headers
 from ...exceptions import some_of
 from ...geometry import similarity
-from ...matching.detector_places import REACH, TURNS
+from ...matching.detectors.detector_places import REACH, TURNS
 from ...results.check import WRONG, Check, FactorTest, state_of
 from .known_effects import DEPARTURES, LAYOUT, STATICS
 from .limits import MOST_NAMED, SEEN, addition_that_shows, as_one
@@ -133,9 +133,8 @@ def _headers(solution, found):
         there = "the stars have them" if found else f"camera {camera.name} has them, which was given"
         return Check("camera", "warn", headers.scatter, FAR, headers.sentence(there), _UNDECIDED)
     if words := headers.sentence(there):
-        far = max(np.hypot(*shift) for shift, agrees in zip(headers.shifts, headers.agree, strict=True) if not agrees)
         cure = _ODD if found else f"--layout fit tells which of the two is right; {_ODD}"
-        return Check("camera", "warn", far, LEAST, words, cure)
+        return Check("camera", "warn", headers.far, LEAST, words, cure)
     where = "the stars put them" if found else f"camera {camera.name} has them, which was given"
     return Check("camera", "pass", headers.scatter, FAR, _alike(solution, headers, where))
 

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from ..geometry import basis, similarity
-from ..inputs.start_poses import estimate_poses
-from .star_lists import allowed_degree, fit_warp
+from ...geometry import basis, similarity
+from ...inputs.start_poses import estimate_poses
+from ..star_lists import allowed_degree, fit_warp
 
 #: How far detectors may be shifted against each other [pix], no more than this part of a detector, and how far the
 #: layouts of headers typically are.
