@@ -366,8 +366,20 @@ def do_nights(a):
     asked = {"date": a.date, found.covariate: a.value}
     at = ", ".join(f"{name} {number:g}" for name, number in asked.items() if number is not None)
     at = f"\n\nThe camera in {a.out} is that of {at}." if at else ""
-    _say(a, f"{found}{at}", found.to_dict(a.date, a.value))
+    figures, inside = found.to_dict(a.date, a.value), _nights_inside(found, a.results)
+    if inside is not None:
+        figures["nights_solved_together"] = records(inside)
+        at = f"\n\nThe nights that were solved together, the worst first; departure: length of both axes:\n{inside}{at}"
+    _say(a, f"{found}{at}", figures)
     return 3 if a.strict and found.odd else 0
+
+
+def _nights_inside(found, results):
+    """The nights of one solution of several, which count as one row of a combination; None of anything else."""
+    alone = len(results) == len(found.nights) == 1 and found.nights[0].nightly is not None
+    if not alone or known_file(results[0]) is not None:
+        return None
+    return legdistort.Solution.read(results[0]).nights
 
 
 def do_difference(a):

@@ -481,6 +481,12 @@ class CombinedNights(ShownAsPrinted):
         if np.any(own := self.exposure_scatter):
             scatter = ", ".join(f"{each:.2g} (degree {d})" for d, each in enumerate(own, 1))
             lines.append(f"Exposures scatter about their night by {scatter} px a coefficient.")
+        together = [f"{each.n_nights} nights of {each.name}" for each in self.nights if each.nightly is not None]
+        if together:
+            lines.append(
+                f"Solved together were {some_of(together, 3)}: they count as one row, their scatter is that found in "
+                "their solution, and how each departs is in the table of its nights (legdistort show)."
+            )
         lines += [*self._said_of_odd(), ""]
         if self.has_focal_plane:
             lines += [*self._camera(None, further_night=False).table_lines(), ""]
@@ -491,7 +497,8 @@ class CombinedNights(ShownAsPrinted):
         forms = {"date": ".3f", "departure": ".4f", "chi2": ".1f", "p": ".2g", "oddness": ".2f", "value": ".6g"}
         for name in forms.keys() & set(shown.colnames):
             shown[name].info.format = forms[name]
-        return "\n".join([*lines, "", *shown.pformat(max_lines=22, max_width=-1)])
+        lines += ["", "Nights, worst first; departure: rms per axis, in the directions that a night determines:"]
+        return "\n".join([*lines, *shown.pformat(max_lines=22, max_width=-1)])
 
 
 @plain_numbers
