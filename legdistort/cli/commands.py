@@ -228,6 +228,8 @@ def do_solve(a):
 
 def do_prior(a):
     """``legdistort prior``."""
+    from ..priors.maps import errors_of, map_paths
+
     prior, of_several = given_prior(a)
     prior.write(a.out, overwrite=a.overwrite)
     rms_x, rms_y = rms = prior.rms.tolist()
@@ -237,7 +239,10 @@ def do_prior(a):
     words += f" {prior.truncation:.2g} px; the distortion is {rms_x:.3g} px rms in x, {rms_y:.3g} in y"
     if (told := (prior.source if isinstance(prior.source, dict) else {}).get("common_map_px")) is not None:
         words += f", with the map of the focal plane that a reference told ({told:.3g} px rms per axis)"
-    _say(a, "; ".join(filter(None, [words, of_several, str(a.out)])), figures)
+    errors = ""
+    if str(a.out).lower().endswith(".fits") and map_paths(a.out)[2].exists():
+        figures["errors_of"], errors = errors_of(prior)
+    _say(a, "; ".join(filter(None, [words, of_several, errors, str(a.out)])), figures)
 
 
 def do_coadd(a):

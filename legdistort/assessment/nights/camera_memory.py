@@ -24,6 +24,7 @@ from ...inputs.table_files import records
 from ...plots.memory_plots import plot_memory
 from ...priors.mode_tables import mode_table
 from ...priors.prior import Prior
+from ...priors.storage import FURTHER_NIGHT, ONE_NIGHT
 from ...results.solution import Solution
 from ...runtime import asdf_files, provenance
 from ...runtime.guards.units import plain_numbers
@@ -242,7 +243,10 @@ class CombinedNights(ShownAsPrinted):
                 "(--camera)"
             )
         static, covariance = self.static(date, value, further_night=True)
-        record = {"kind": "nights", "name": self.name, "nights": len(self.nights)}
+        record = {"kind": "nights", "name": self.name, "camera": self.name, "nights": len(self.nights)}
+        record["errors_of"] = FURTHER_NIGHT if self.scatter.any() else ONE_NIGHT
+        if np.isfinite(self.dates).any():
+            record["dates"] = [float(np.nanmin(self.dates)), float(np.nanmax(self.dates))]
         known = Prior(static, static_covariance=covariance, shape=self.shape, source=record)
         if not (one_exposure and np.any(self.exposure_scatter)):
             return known
