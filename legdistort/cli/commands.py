@@ -228,6 +228,8 @@ def do_solve(a):
 
 def do_prior(a):
     """``legdistort prior``."""
+    from ..priors.maps import errors_of, map_paths
+
     prior, of_several = given_prior(a)
     prior.write(a.out, overwrite=a.overwrite)
     rms_x, rms_y = rms = prior.rms.tolist()
@@ -237,7 +239,10 @@ def do_prior(a):
     words += f" {prior.truncation:.2g} px; the distortion is {rms_x:.3g} px rms in x, {rms_y:.3g} in y"
     if (told := (prior.source if isinstance(prior.source, dict) else {}).get("common_map_px")) is not None:
         words += f", with the map of the focal plane that a reference told ({told:.3g} px rms per axis)"
-    _say(a, "; ".join(filter(None, [words, of_several, str(a.out)])), figures)
+    errors = ""
+    if str(a.out).lower().endswith(".fits") and map_paths(a.out)[2].exists():
+        figures["errors_of"], errors = errors_of(prior)
+    _say(a, "; ".join(filter(None, [words, of_several, errors, str(a.out)])), figures)
 
 
 def do_coadd(a):
@@ -366,8 +371,20 @@ def do_nights(a):
     asked = {"date": a.date, found.covariate: a.value}
     at = ", ".join(f"{name} {number:g}" for name, number in asked.items() if number is not None)
     at = f"\n\nThe camera in {a.out} is that of {at}." if at else ""
-    _say(a, f"{found}{at}", found.to_dict(a.date, a.value))
+    figures, inside = found.to_dict(a.date, a.value), _nights_inside(found, a.results)
+    if inside is not None:
+        figures["nights_solved_together"] = records(inside)
+        at = f"\n\nThe nights that were solved together, the worst first; departure: length of both axes:\n{inside}{at}"
+    _say(a, f"{found}{at}", figures)
     return 3 if a.strict and found.odd else 0
+
+
+def _nights_inside(found, results):
+    """The nights of one solution of several, which count as one row of a combination; None of anything else."""
+    alone = len(results) == len(found.nights) == 1 and found.nights[0].nightly is not None
+    if not alone or known_file(results[0]) is not None:
+        return None
+    return legdistort.Solution.read(results[0]).nights
 
 
 def do_difference(a):

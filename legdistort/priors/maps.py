@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
+from astropy.time import Time
 from scipy.interpolate import RectBivariateSpline
 
+from ..cameras.camera import IMAGE
 from ..exceptions import InputError
 from ..geometry import basis
 from ..geometry.detector_modes import similarity_basis
@@ -18,6 +20,7 @@ from ..results.errors import absolute_errors
 from ..results.solution import Solution
 from ..runtime.outputs import check_file, replacing
 from ..runtime.provenance import checksums
+from .storage import FURTHER_NIGHT, ONE_NIGHT
 
 #: Places along each axis where errors are made, between which splines run; how many of them, and pixels, at once.
 _PLACES, _TOGETHER, _PIECE = 65, 500, 1 << 18
@@ -28,6 +31,23 @@ _FILES = {
     "x_err": "standard error of the shift in x",
     "y_err": "standard error of the shift in y",
 }
+
+
+_UNNAMED = IMAGE, "camera"  # names of cameras that have none
+#: Of what the errors are, by the word in the header.
+_ERRORS_OF = {
+    FURTHER_NIGHT: "of a further night: the error of the mean of the nights and the scatter between nights",
+    ONE_NIGHT: "of the one night that the map is of, which does not tell how far nights scatter",
+    "exposure": "of an exposure of the night that the map is of, which does not tell how far nights scatter",
+    "stated": "as stated of the static distortion (static_sigma)",
+}
+
+
+def errors_of(prior):
+    """Of what the errors of the maps of a prior are, if they have errors: a word, and it in a sentence."""
+    of = prior.source.get("errors_of", "stated") if isinstance(prior.source, dict) else "stated"
+    of = "exposure" if prior.static_sigma is None else of
+    return of, f"errors are those {_ERRORS_OF[of]}"
 
 
 def map_paths(path):
@@ -74,16 +94,34 @@ def write_maps(prior, path, *, solution=None, overwrite=False):
     maps = list(_shifts(distortion))
     if prior.static_sigma is not None or solution is not None:
         maps += list(_errors(prior, solution, distortion, path))
+    stated = _stated(prior, len(maps) > 2)
     for each, (word, what), values in zip(paths, _FILES.items(), maps, strict=False):
         hdu = fits.PrimaryHDU(values)
         hdu.header["BUNIT"] = "pix"
         hdu.header["EXTNAME"] = word.upper()
+        hdu.header.extend(stated)
         hdu.header["COMMENT"] = f"legdistort: {what}"
         with replacing(each, overwrite=overwrite) as file:
             hdu.writeto(file)
     for stale in paths[len(maps) :]:
         stale.unlink(missing_ok=True)
     return paths[: len(maps)]
+
+
+def _stated(prior, with_errors):
+    """Cards on the camera and the dates of a map, where they are known, and on what its errors are of."""
+    known, out = prior.source if isinstance(prior.source, dict) else {}, fits.Header()
+    if known.get("camera") not in (None, *_UNNAMED):
+        out["CAMERA"] = (known["camera"], "the distortion is of this camera")
+    dates = [Time(year, format="jyear").isot[:10] for year in known.get("dates", ())]
+    if len(set(dates)) == 1:
+        out["DATE-AVG"] = (dates[0], "mean of the exposures")
+    elif dates:
+        out["DATE-BEG"], out["DATE-END"] = (dates[0], "of the first exposures"), (dates[1], "of the last ones")
+    if with_errors:
+        out["ERRORSOF"], words = errors_of(prior)
+        out["HISTORY"] = words
+    return out
 
 
 def _solution_of(prior):

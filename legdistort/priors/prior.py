@@ -243,7 +243,10 @@ class Prior(ShownAsPrinted):
     @plain_numbers
     def with_static_sigma(self, static_sigma: ArrayLike | None) -> Prior:
         """The same prior with another uncertainty `static_sigma` of its mean, in the place of a covariance too."""
-        return replace(self, static_sigma=static_sigma, static_covariance=None)
+        source = self.source
+        if isinstance(source, dict):
+            source = {key: value for key, value in source.items() if key != "errors_of"}
+        return replace(self, static_sigma=static_sigma, static_covariance=None, source=source)
 
     @plain_numbers
     def correct_table(self, table: Table) -> QTable:
@@ -489,7 +492,9 @@ class Prior(ShownAsPrinted):
         """Write everything to an ASDF file (`legdistort.priors.storage`).
 
         Or, as ``NAME.fits``, the mean and the table as maps of shifts, ``NAME_x.fits`` and ``NAME_y.fits``, and with
-        `static_sigma` maps of their errors, ``NAME_x_err.fits`` and ``NAME_y_err.fits`` (`legdistort.priors.maps`).
+        `static_sigma` maps of their errors, ``NAME_x_err.fits`` and ``NAME_y_err.fits`` (`legdistort.priors.maps`);
+        the keyword ``ERRORSOF`` of their headers says of what: ``further night``, with the scatter between nights,
+        ``exposure`` of one night, or ``stated``.
 
         Raises
         ------

@@ -16,7 +16,7 @@ from ..geometry import similarity
 from ..geometry.basis import check_degree
 from ..geometry.detector_modes import pointed
 from ..geometry.distortion import Distortion
-from ..results.nights import found
+from ..results.nights import blocks, found
 from ..results.solution import Solution
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, check_layout, check_tree, entry_of, read_tree, understood
@@ -26,6 +26,8 @@ from .from_files import read_source
 
 #: Version of the layout under ``legdistort_prior``.
 LAYOUT = 1
+#: Of what the `static_sigma` of a prior that nights were combined to is the error, as its source says.
+FURTHER_NIGHT, ONE_NIGHT = "further night", "night"
 
 
 def write_prior(prior, path, *, overwrite=False):
@@ -111,7 +113,7 @@ def _ready(where, kind, ext):
     if entry == "legdistort_prior":
         return found
     camera = found if entry == "legdistort_camera" else found.camera
-    source = {"kind": "camera", "name": str(where)}
+    source = {"kind": "camera", "name": str(where), "camera": camera.name} | _nights_in(where)
     if camera.has_focal_plane:
         return _of_detector(camera, ext, kind, source)
     if camera is not found:  # of a solution, the static distortion of the exposures of another field
@@ -119,6 +121,16 @@ def _ready(where, kind, ext):
     (detector,) = camera.detectors.values()
     errors = {"static_sigma": detector.static_sigma, "static_covariance": detector.static_covariance}
     return kind(detector.static, **errors, shape=detector.shape, source=source)
+
+
+def _nights_in(path):
+    """What a file says of the nights that its camera was made of, and of what its errors are."""
+    if entry_of(path, ["legdistort_nights"]) is None:
+        return {}
+    tree = read_tree(path)["legdistort_nights"]
+    dates = [night["date"] for night in tree["nights"] if night["date"] is not None]
+    out = {"errors_of": FURTHER_NIGHT if np.any(tree["scatter"]) else ONE_NIGHT}
+    return out | ({"dates": [float(min(dates)), float(max(dates))]} if dates else {})
 
 
 def _of_detector(camera, key, kind, source):
@@ -167,9 +179,14 @@ def of_solution(solution, kind, source):
     common = next(iter(static.values())) if len(static) == 1 else None
     left_out = [*own.values(), *(static.values() if common is None else ())]
     left = max((float(np.hypot(*table.values).max()) for table in left_out), default=0.0)
-    known = {"shape": shapes.pop(), "source": {"kind": "solution"} | source, "truncation": left, "table": common}
+    source = {"kind": "solution", "camera": solution.camera.name} | source
+    years = blocks(solution)[2]
+    if np.isfinite(years).any():
+        source["dates"] = [float(np.nanmin(years)), float(np.nanmax(years))]
+    known = {"shape": shapes.pop(), "truncation": left, "table": common}
     statics = found(solution).statics
     if len(statics) != 1:
-        return kind(solution.coefficients.mean(axis=0), **known)
+        return kind(solution.coefficients.mean(axis=0), **known, source=source)
+    known["source"] = source | {"errors_of": FURTHER_NIGHT}
     errors = {"static_sigma": statics[0].sigma, "static_covariance": statics[0].covariance}
     return kind(statics[0].mean, **errors, **known)

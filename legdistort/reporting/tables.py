@@ -114,8 +114,8 @@ def nights_table(solution):
     nights = solution.nights
     if len(nights) < 2:
         return None
-    head = {"night": "", "exposures": "", "stars": "", "rms": "px", "rms over errors": "", "departure": "rms, px"}
-    head |= {"over scatter": "", "chi2": "", "dof": "", "p": "", "which": ""}
+    head = {"night": "", "exposures": "", "stars": "", "rms": "px", "rms over errors": ""}
+    head |= {"departure": "rms length, px", "over scatter": "", "chi2": "", "dof": "", "p": "", "which": ""}
     rows = []
     for row in nights:
         departing = [f"{row['departure'].value:.4f}", f"{row['ratio']:.2f}", f"{row['chi2']:.1f}", f"{row['dof']:.0f}"]
@@ -130,9 +130,10 @@ def nights_table(solution):
     return Table(
         head,
         rows,
-        "The worst first. Departure: what the exposures of a night have in common, from the static distortion of all "
-        "other nights; over the scatter of these and all errors; p is the probability of so much by chance. Nights "
-        "that depart farther than the others do are marked, and the rest is compared without them.",
+        "The worst first. Departure: length, both axes together, of what the exposures of a night have in common, from "
+        "the static distortion of all other nights; over the scatter of these and all errors; p is the probability of "
+        "so much by chance. Nights that depart farther than the others do are marked, and the rest is compared without "
+        "them.",
     )
 
 

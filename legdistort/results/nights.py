@@ -19,7 +19,7 @@ class NightTest:
     Attributes
     ----------
     departure : float or None
-        Pixels, rms over the detector; None if there are no others.
+        Pixels, rms length, both axes together, over the detector; None if there are no others.
     ratio : float
         Root of its mean square over that of its errors and of the scatter of the other nights.
     chi2, dof : float
@@ -161,7 +161,7 @@ def _lines(nights):
     out = [
         f"{'night':{width}s} {'exposures':>9s} {'stars':>5s} {'rms':>7s} {'rms/error':>9s} {'departure':>9s} "
         f"{'ratio':>6s} {'p':>8s}",
-        f"{'px':>{width + 24}s} {'px':>19s}",
+        f"{'px':>{width + 24}s} {'px length':>19s}",
     ]
     for row in nights:
         departure = f"{row['departure'].value:9.4f} {row['ratio']:6.2f} {row['p']:8.2g}" if row["dof"] else f"{'-':>9s}"

@@ -176,12 +176,13 @@ class Solution(ShownAsPrinted):
 
         ``name`` (the label of the column ``block``, else the date), ``block`` (its number), ``epoch`` [yr],
         ``n_exposures``, ``n_stars``; ``rms`` [pix] of its residuals, per axis, and ``rms_ratio`` of these over their
-        errors; ``departure`` [pix], rms over the detector, of what its exposures have in common from the static
-        distortion of all other nights, ``ratio`` over the scatter of these and all errors, with its ``chi2``, ``dof``
-        and ``p``, the probability of so much by chance. A night that is ``odd`` departs farther than the others do
-        (p < 0.001 over the number of nights, and three times as far), and the rest is compared without it; none is
-        where there are no two others. Of two nights p is that of no departure at all. Without others, and where
-        exposures have no distortion of their own, there is no departure (NaN, ``dof`` 0). ``exposures``: their names.
+        errors; ``departure`` [pix], rms length over the detector, both axes together, of what its exposures have in
+        common from the static distortion of all other nights, ``ratio`` over the scatter of these and all errors, with
+        its ``chi2``, ``dof`` and ``p``, the probability of so much by chance. A night that is ``odd`` departs farther
+        than the others do (p < 0.001 over the number of nights, and three times as far), and the rest is compared
+        without it; none is where there are no two others. Of two nights p is that of no departure at all. Without
+        others, and where exposures have no distortion of their own, there is no departure (NaN, ``dof`` 0).
+        ``exposures``: their names.
         `print` shows the columns that tell how a night differs; ``pprint_all()`` shows all.
         """
         return nights.table(self)

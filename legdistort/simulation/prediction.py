@@ -17,7 +17,7 @@ from ..exceptions import LegdistortError
 from ..geometry import basis
 from ..matching.matches import alone
 from ..results import accuracy
-from ..results.errors.absolute_errors import relative_blocks
+from ..results.errors.absolute_errors import absolute_blocks, relative_blocks
 from ..results.solution import Solution
 from ..runtime.checks import check_positive
 from ..runtime.guards.units import plain_numbers
@@ -164,18 +164,24 @@ class Prediction(ShownAsPrinted):
 
     @property
     def motion_errors(self) -> dict[str, float]:
-        """Expected errors of proper motions [pix/yr per axis] and parallaxes [pix], relative, rms over the stars.
+        """Expected errors of proper motions [pix/yr per axis] and parallaxes [pix], rms over the stars.
 
-        ``{"motion" | "parallax": error}``, empty without epochs. ``solution.stars`` has them star by star.
+        ``{"motion" | "parallax": error}``, relative, and with ``_abs`` at the end of the name absolute: with the common
+        map that changes with time, by departures of the exposures. What all stars move by, and rates of rotation and
+        scale, are aside; NaN where `b_abs` is not known. Empty without epochs. ``solution.stars`` has them star by
+        star.
         """
-        if self.solution.estimate.motions is None:
-            return {}
-        relative = relative_blocks(
-            self.solution.gauge, self.solution.estimate.uncertainty, self.solution.estimate.positions
-        )
-        variance = np.einsum("jkk->kj", relative)
-        out = {"motion": finite_rms(np.sqrt(variance[2:4]))}
-        return out | ({"parallax": finite_rms(np.sqrt(variance[4]))} if len(variance) > 4 else {})
+        estimate, out = self.solution.estimate, {}
+        if estimate.motions is None:
+            return out
+        known = self.solution.gauge, estimate.uncertainty, estimate.positions
+        variances = {"": relative_blocks(*known)}
+        variances["_abs"] = absolute_blocks(*known) if np.isfinite(self.b_abs) else np.full_like(variances[""], np.nan)
+        names = {"motion": slice(2, 4)} | ({"parallax": slice(4, 5)} if variances[""].shape[1] > 4 else {})
+        for name, which in names.items():
+            for suffix, blocks in variances.items():
+                out[name + suffix] = finite_rms(np.sqrt(np.einsum("jkk->kj", blocks)[which]))
+        return out
 
     def summary(self) -> dict[str, float]:
         """All figures as a dict of numbers."""

@@ -4,7 +4,8 @@ import textwrap
 
 import numpy as np
 
-_MOTIONS = {"motion": "proper motions, relative [{}/yr]", "parallax": "parallaxes, relative [{}]"}
+_MOTIONS = {"motion": "proper motions, relative [{}/yr]", "motion_abs": "proper motions, absolute [{}/yr]"}
+_MOTIONS |= {"parallax": "parallaxes, relative [{}]", "parallax_abs": "parallaxes, absolute [{}]"}
 
 
 def decimals(prediction, scale=1.0):
@@ -62,7 +63,7 @@ def describe(prediction):
             *(row(_MOTIONS[name].format(unit), error) for name, error in prediction.motion_errors.items()),
             *(f"found beside, of the size that is stated: {term!r}" for term in prediction.settings.terms),
             *_by_magnitude(prediction),
-            *textwrap.wrap(f"All but b, absolute, are relative: {_relative(prediction)}", 110),
+            *textwrap.wrap(f"All but what is called absolute is relative: {_relative(prediction)}", 110),
             f"gauge {solution.gauge.kind}; thumb: s_b = 1/sqrt(n_im), s_sigma = sqrt((1 - 1/n_im)(1 + n_modes/n_star))",
         ]
     )
@@ -94,15 +95,17 @@ def _relative(prediction):
 
 def describe_plans(plans):
     """The table of `Prediction.alternatives` as text: criteria (aliasing if any is known), slopes, rules of thumb."""
-    criteria = [c for c in ("b", "b_alias", "b_abs", "sigma", "sigma_alias") if np.nansum(plans[c]) > 0]
+    criteria = ["b", "b_alias", "b_abs", "sigma", "sigma_alias", *(f"{name}_error" for name in _MOTIONS)]
+    criteria = [c for c in criteria if c in plans.colnames and np.nansum(plans[c]) > 0]
     if (scale := plans.meta["pixel_scale"]) is not None:
         plans = plans.copy()
-        for name in criteria:
+        units = {name: "mas/yr" if name.startswith("motion") else "mas" for name in criteria}
+        for name, unit in units.items():
             places = max(0, int(plans[name].info.format[1:-1]) - int(np.round(np.log10(1e3 * scale))))
             plans[name] = 1e3 * scale * np.asarray(plans[name])
             plans[name].info.format = f".{places}f"
-            plans.rename_column(name, f"{name} [mas]")
-        criteria = [f"{name} [mas]" for name in criteria]
+            plans.rename_column(name, f"{name} [{unit}]")
+        criteria = [f"{name} [{unit}]" for name, unit in units.items()]
     columns = ["n_exposures", "degree", "n_stars", *criteria, "s_b", "thumb_b", "s_sigma", "thumb_sigma"]
     lines = plans[columns].pformat(max_lines=-1, max_width=-1)
     return "\n".join(lines + [f"{change}: {reason}" for change, reason in plans.meta["failed"].items()])

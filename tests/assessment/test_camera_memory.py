@@ -285,6 +285,28 @@ def test_nights_that_were_solved_together_speak_of_the_camera(three):
     assert_allclose(both.scatter, combined.scatter)
 
 
+def test_the_command_prints_the_nights_of_one_solution(tmp_path, capsys):
+    """One row is all that a solution is to a combination; which of its nights differs is in its own table."""
+    nights = Nights(4, nights=4, per=3, odd=0.5, n_stars=60, degree=2)
+    solution = ld.solve(ld.Matches.from_table(nights.table, shape=SHAPE), degree=2)
+    solution.write(tmp_path / "joint.asdf")
+    line = ["nights", str(tmp_path / "joint.asdf"), "--workers", "1", "--quiet", "--out", str(tmp_path / "camera.asdf")]
+    assert main(line) == 0
+    printed = capsys.readouterr().out
+    assert "Solved together were 3 nights of " in printed
+    rows = printed[printed.index("The nights that were solved together") :].splitlines()
+    assert [row.split()[0] for row in rows[3:]] == solution.nights["name"].tolist()
+    assert rows[3].endswith("  odd")  # three lists of the third night, alone
+    assert sum(row.endswith("odd") for row in rows) == 1
+    again = [line[0], str(tmp_path / "camera.asdf"), *line[2:-1], str(tmp_path / "again.asdf"), "--json"]
+    assert main(again) == 0  # an earlier combination has no table of them
+    assert "nights_solved_together" not in json.loads(capsys.readouterr().out)
+    assert main([*line, "--overwrite", "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)["nights_solved_together"]
+    assert [row["odd"] for row in figures] == [True, False, False, False]
+    assert figures[0]["exposures"] == "n2e0, n2e1, n2e2"
+
+
 @pytest.mark.slow
 def test_an_odd_night_among_others_that_were_solved_with_it_is_left_out():
     nights = Nights(4, nights=6, per=4, nightly=0.02, odd=0.5, n_stars=90)

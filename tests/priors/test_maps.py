@@ -4,6 +4,8 @@ import four_detectors
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.time import Time
+from night_sets import SIZE, Nights, field
 from numpy.polynomial import legendre
 from numpy.testing import assert_allclose, assert_array_equal
 from rough_optics import Mask, beyond, modes
@@ -14,7 +16,7 @@ from legdistort.cli.parser import main
 from legdistort.exceptions import InputError, SolveError
 from legdistort.geometry import basis
 from legdistort.geometry.tabulated.displacement_table import DisplacementTable
-from legdistort.priors.maps import map_paths, write_maps
+from legdistort.priors.maps import errors_of, map_paths, write_maps
 
 SHAPE = (120, 160)
 ROUGH = {"size": 400, "holes_along": 12, "n_exposures": 7, "shift": 16.0, "noise": 0.0015, "highest": 5.0, "rough": 0.3}
@@ -282,6 +284,43 @@ def test_the_static_of_a_solution_with_its_errors(tmp_path):
     assert_allclose(np.sqrt(np.sum(prior.static_sigma**2) / 8), everywhere, rtol=0.05)
     known = ld.Prior.from_solution(solution)
     assert_array_equal([fits.getdata(each) for each in write_maps(known, tmp_path / "t.fits", solution=solution)], maps)
+
+
+def test_of_what_error_maps_are(tmp_path, capsys):
+    """Of a further night, where several tell how far nights scatter: six of 0.05 px a coefficient, by numpy."""
+    nights = Nights(2, nights=6, per=3, nightly=0.05, n_stars=90, degree=2, roll=60.0)
+    solution = ld.solve(ld.Matches.from_table(nights.table, shape=(SIZE, SIZE)), degree=2)
+    known, headers = ld.Prior.from_solution(solution), []
+    for prior in (known, known.with_static_sigma(0.1)):
+        prior.write(tmp_path / "prior.asdf", overwrite=True)
+        line = ["prior", str(tmp_path / "prior.asdf"), "--out", str(tmp_path / "s.fits"), "--overwrite"]
+        assert main(line) == 0
+        headers.append([fits.getheader(path) for path in map_paths(tmp_path / "s.fits")])
+        words = "".join(headers[-1][0]["HISTORY"])
+        assert words in capsys.readouterr().out
+        if prior is known:
+            error = np.array([fits.getdata(path) for path in map_paths(tmp_path / "s.fits")[2:]])
+    assert {header["ERRORSOF"] for header in headers[0]} == {"further night"}
+    assert {header["ERRORSOF"] for header in headers[1]} == {"stated"}
+    first, last = nights.table["epoch"].min(), nights.table["epoch"].max()
+    for key, year in (("DATE-BEG", first), ("DATE-END", last)):
+        assert Time(headers[0][0][key]).jyear == pytest.approx(year, abs=0.01)
+    assert "CAMERA" not in headers[0][0]  # it has no name
+    u, v = (each.ravel() for each in np.meshgrid(*2 * [np.linspace(-1, 1, 21)]))
+    rng, squares_ = np.random.default_rng(0), []
+    for _ in range(200):
+        z = legendre.legval2d(u, v, field(rng, 0.05, 2).transpose(1, 2, 0)).T @ [1, 1j]
+        design = np.stack([np.ones(len(u)), u + 1j * v], axis=1)
+        z = z - design @ np.linalg.lstsq(design, z, rcond=None)[0]
+        squares_.append(np.mean(np.abs(z) ** 2) / 2)
+    assert 0.7 < np.sqrt(np.mean(error**2) / np.mean(squares_)) < 1.6  # that of their mean would be 0.4 of it
+    assert errors_of(ld.Prior(np.zeros((2, 6)), shape=SHAPE))[0] == "exposure"
+    camera = ld.combine_nights([known], name="NIRC2")
+    assert errors_of(camera.prior())[0] == "night"
+    camera.write(tmp_path / "camera.asdf")
+    assert main(["prior", str(tmp_path / "camera.asdf"), "--out", str(tmp_path / "c.fits")]) == 0
+    header = fits.getheader(tmp_path / "c_y_err.fits")
+    assert (header["ERRORSOF"], header["CAMERA"]) == ("night", "NIRC2")
 
 
 @pytest.mark.slow

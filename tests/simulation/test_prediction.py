@@ -20,6 +20,7 @@ from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.simulation.observations import simulate_matches
 from legdistort.simulation.prediction import predict
+from legdistort.simulation.prediction_text import describe_plans
 from legdistort.simulation.truth import displacement
 from legdistort.solving.equations import covariances, reduced_system
 from legdistort.solving.estimation import solve
@@ -522,3 +523,72 @@ def test_command(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main([*asked, "--n-stars", "30", "--spectrum", "much"])
     assert "much is not of the form 3=0.9,4=0.1" in capsys.readouterr().err
+
+
+# --- motions -----------------------------------------------------------------------------------------------------
+
+
+def dense_motions(xy, years, sigma, dynamic, dithers, *, degree=2):
+    """Errors of motions by a dense Fisher matrix, numpy alone: without a common map, and without a similarity.
+
+    Unknowns are positions, motions, and coefficients of every exposure, which but for its similarity scatter about
+    zero by `dynamic`.
+    """
+    n, orders = len(xy), [(k - j, j) for k in range(degree + 1) for j in range(k + 1)]
+    m = len(orders)
+    information = np.zeros((4 * n + len(years) * 2 * m,) * 2)
+    similar = np.zeros((4, 2, m))
+    similar[0, 0, 0] = similar[1, 1, 0] = similar[2, 0, 1] = similar[2, 1, 2] = similar[3, 1, 1] = 1
+    similar[3, 0, 2] = -1
+    similar = similar.reshape(4, -1) / np.linalg.norm(similar.reshape(4, -1), axis=1)[:, None]
+
+    def series(q):
+        along = [
+            np.polynomial.legendre.legvander(w, degree) * np.sqrt((2 * np.arange(degree + 1) + 1) / 2)
+            for w in ((2 * q + 1) / 2048 - 1).T
+        ]
+        return np.stack([along[0][:, a] * along[1][:, b] for a, b in orders], axis=1)
+
+    for i, (year, dither) in enumerate(zip(years, dithers, strict=True)):
+        own = 4 * n + 2 * m * i + np.arange(2 * m)
+        for axis in range(2):
+            rows = np.zeros((n, len(information)))
+            rows[np.arange(n), axis * n + np.arange(n)] = 1
+            rows[np.arange(n), (2 + axis) * n + np.arange(n)] = year - years.mean()
+            rows[:, own.reshape(2, m)[axis]] = series(xy + dither)
+            information += rows.T @ rows / sigma**2
+        information[np.ix_(own, own)] += (np.eye(2 * m) - similar.T @ similar) / dynamic**2
+    covariance = np.linalg.pinv(information, rcond=1e-13, hermitian=True)[2 * n : 4 * n, 2 * n : 4 * n]
+    z, one = xy - xy.mean(axis=0), np.ones(n)
+    turned = np.stack([np.r_[one, 0 * one], np.r_[0 * one, one], z.T.ravel(), np.r_[-z[:, 1], z[:, 0]]], axis=1)
+    out = []
+    for columns in (np.kron(np.eye(2), series(xy)), turned):
+        basis_ = np.linalg.qr(columns)[0]
+        left = np.eye(2 * n) - basis_ @ basis_.T
+        out.append(np.sqrt(np.trace(left @ covariance @ left) / (2 * n)))
+    return out
+
+
+@pytest.mark.parametrize("dynamic", [0.1, 0.02])
+def test_the_fisher_matrix_of_motions(dynamic):
+    rng = np.random.default_rng(0)
+    xy, dithers = rng.uniform(100, 1948, (40, 2)), rng.uniform(-90, 90, (9, 2))
+    years = np.add.outer([2020.0, 2022.0, 2024.0], [0.0, 0.1, 0.2]).ravel()
+    words = {"n_exposures": 9, "stars": xy, "sigma": 0.02, "degree": 2, "dithers": dithers, "epochs": years}
+    plan = predict(**words, dynamic=dynamic, prior=Prior(np.zeros((2, 6)), shape=SHAPE))
+    found = [plan.motion_errors[name] for name in ("motion", "motion_abs")]
+    assert_allclose(found, dense_motions(xy, years, 0.02, dynamic, dithers), rtol=0.03)
+    assert f"proper motions, absolute [px/yr]{found[1]:23.5f}" in str(plan)
+    table = plan.alternatives()
+    assert_allclose([table["motion_error"][0], table["motion_abs_error"][0]], found)
+    assert "motion_abs_error" in describe_plans(table)
+
+
+def test_absolute_motions_are_not_known_where_nothing_is_assumed_of_departures():
+    words = {"n_stars": 40, "sigma": 0.02, "degree": 2, "epochs": [2020.0, 2020.1, 2022.0, 2022.1, 2024.0, 2024.1]}
+    plan = predict(n_exposures=6, **words, dithers=100.0)
+    assert np.isnan(plan.motion_errors["motion_abs"])
+    assert np.isfinite(plan.motion_errors["motion"])
+    assert any(line.split()[:3] + line.split()[-2:] == ["proper", "motions,", "absolute", "not", "known"]
+               for line in str(plan).splitlines())  # fmt: skip
+    assert "motion_abs_error" not in describe_plans(plan.alternatives())

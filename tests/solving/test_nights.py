@@ -52,7 +52,7 @@ def test_a_printed_table_of_nights_fits_into_a_terminal():
     assert len(printed) == 10
     assert max(map(len, printed)) <= 79
     assert printed[0].split() == ["night", "exposures", "stars", "rms", "rms/error", "departure", "ratio", "p"]
-    assert printed[1].split() == ["px", "px"]
+    assert printed[1].split() == ["px", "px", "length"]
     assert [line.split()[0] for line in printed[2:]] == nights["name"].tolist()
     assert str(nights[:0]).splitlines() == printed[:2]
     assert str(nights["name", "chi2"]).split()[:2] == ["name", "chi2"]

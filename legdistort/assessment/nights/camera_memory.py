@@ -24,6 +24,7 @@ from ...inputs.table_files import records
 from ...plots.memory_plots import plot_memory
 from ...priors.mode_tables import mode_table
 from ...priors.prior import Prior
+from ...priors.storage import FURTHER_NIGHT, ONE_NIGHT
 from ...results.solution import Solution
 from ...runtime import asdf_files, provenance
 from ...runtime.guards.units import plain_numbers
@@ -242,7 +243,10 @@ class CombinedNights(ShownAsPrinted):
                 "(--camera)"
             )
         static, covariance = self.static(date, value, further_night=True)
-        record = {"kind": "nights", "name": self.name, "nights": len(self.nights)}
+        record = {"kind": "nights", "name": self.name, "camera": self.name, "nights": len(self.nights)}
+        record["errors_of"] = FURTHER_NIGHT if self.scatter.any() else ONE_NIGHT
+        if np.isfinite(self.dates).any():
+            record["dates"] = [float(np.nanmin(self.dates)), float(np.nanmax(self.dates))]
         known = Prior(static, static_covariance=covariance, shape=self.shape, source=record)
         if not (one_exposure and np.any(self.exposure_scatter)):
             return known
@@ -481,6 +485,12 @@ class CombinedNights(ShownAsPrinted):
         if np.any(own := self.exposure_scatter):
             scatter = ", ".join(f"{each:.2g} (degree {d})" for d, each in enumerate(own, 1))
             lines.append(f"Exposures scatter about their night by {scatter} px a coefficient.")
+        together = [f"{each.n_nights} nights of {each.name}" for each in self.nights if each.nightly is not None]
+        if together:
+            lines.append(
+                f"Solved together were {some_of(together, 3)}: they count as one row, their scatter is that found in "
+                "their solution, and how each departs is in the table of its nights (legdistort show)."
+            )
         lines += [*self._said_of_odd(), ""]
         if self.has_focal_plane:
             lines += [*self._camera(None, further_night=False).table_lines(), ""]
@@ -491,7 +501,8 @@ class CombinedNights(ShownAsPrinted):
         forms = {"date": ".3f", "departure": ".4f", "chi2": ".1f", "p": ".2g", "oddness": ".2f", "value": ".6g"}
         for name in forms.keys() & set(shown.colnames):
             shown[name].info.format = forms[name]
-        return "\n".join([*lines, "", *shown.pformat(max_lines=22, max_width=-1)])
+        lines += ["", "Nights, worst first; departure: rms per axis, in the directions that a night determines:"]
+        return "\n".join([*lines, *shown.pformat(max_lines=22, max_width=-1)])
 
 
 @plain_numbers

@@ -79,12 +79,7 @@ def mirrored_check(solution, detectors):
     No turn makes a detector its mirror image: axes were exchanged, or one reversed, so that the static distortion of
     such an exposure is not that of the others. `detectors` are numbers (n_exposures,).
     """
-    parities = [similarity.describe(solution.poses[name])["parity"] for name in solution.names]
-    reversed_ = np.array(parities) < 0
-    odd = np.zeros(len(detectors), dtype=bool)
-    for detector in np.unique(detectors):
-        of = detectors == detector
-        odd |= of & (reversed_ if 2 * np.count_nonzero(reversed_ & of) <= np.count_nonzero(of) else ~reversed_)
+    odd = _mirrored(solution, detectors)
     if not odd.any():
         return None
     names, share = [name for name, is_odd in zip(solution.names, odd, strict=True) if is_odd], float(odd.mean())
@@ -96,6 +91,17 @@ def mirrored_check(solution, detectors):
     )
     cure = f"exchange x and y there, or what else is reversed; else --without {shlex.join(names)}"
     return Check("mirrored", "fail" if share < 0.5 else "warn", share, 0.0, found, cure, exposures=tuple(names))
+
+
+def _mirrored(solution, detectors):
+    """Which exposures, (n_exposures,), are mirrored against most of their detector."""
+    parities = [similarity.describe(solution.poses[name])["parity"] for name in solution.names]
+    reversed_ = np.array(parities) < 0
+    odd = np.zeros(len(detectors), dtype=bool)
+    for detector in np.unique(detectors):
+        of = detectors == detector
+        odd |= of & (reversed_ if 2 * np.count_nonzero(reversed_ & of) <= np.count_nonzero(of) else ~reversed_)
+    return odd
 
 
 def nights_check(solution, *, error):
@@ -123,7 +129,7 @@ def nights_check(solution, *, error):
 
 
 def _far(name, ratio, rms):
-    return f"{name} {ratio:.2g} times as far as the others, by {rms:.2g} px rms"
+    return f"{name} {ratio:.2g} times as far as the others, by {rms:.2g} px, rms length of both axes together"
 
 
 def _of_night(row):
@@ -137,25 +143,31 @@ def _odd(solution, problem, blocks, nights):
 
     The farthest first: name, how many times as far as these, by how many pixels rms, and the `FactorTest`: squares by
     degree over those of the others, beyond the errors of the coefficients. If all scatter alike, by degree, they are
-    distributed as F. The exposures of nights that are odd as a whole, by their numbers, are not among them.
+    distributed as F. The exposures of nights that are odd as a whole, by their numbers, are not among them, nor are
+    mirrored ones among the others: two would explain each other by a map of the plane. What such a map explains is not
+    odd: one bad exposure draws it to itself, and those that are turned would show that.
     """
     found, names = [], np.array(solution.names)
     size, degrees = problem.n_modes, dynamic_degrees(problem.n_modes)
+    mirrored = _mirrored(solution, problem.detectors)
     asked = ~np.isin(np.broadcast_to(problem.night, len(names)), list(nights))
     for detector in np.unique(problem.detectors):
         each = np.flatnonzero((problem.detectors == detector) & asked)
-        if len(each) < _FEWEST:
+        if len(each) < _FEWEST or np.count_nonzero(~mirrored[each]) < _FEWEST - 1:
             continue
         rows = dynamic_basis(problem.shapes[each[0]], size)
         a = (solution.coefficients - solution.estimate.prior_mean)[each, :, :size].reshape(len(each), -1) @ rows.T
         noise = np.einsum("ka,iab,kb->ik", rows, np.linalg.inv(blocks.u[each]), rows)
-        out = beyond_chance(a, noise, degrees, FALSE_ALARM / len(names), fewest=_FEWEST - 1)
+        moved = rows @ solution.gauge.all_motion[each]
+        out = np.flatnonzero(mirrored[each])
+        out = beyond_chance(a, noise, degrees, FALSE_ALARM / len(names), fewest=_FEWEST - 1, moved=moved, out=out)
         for k in out:
             others = with_others(a, out, k)
-            ratio, chi2, p = (value[others == k][0] for value in compared(a[others], noise[others], degrees))
+            away, ratio, chi2, dof, p = (
+                value[others == k][0] for value in compared(a[others], noise[others], degrees, moved[others])
+            )
             if p < FALSE_ALARM / len(names) and ratio > _ODD:
                 name = names[each[k]]
-                test = FactorTest(f"departure of {name}", _OTHERS, len(rows), float(chi2), len(rows), float(p))
-                rms = np.linalg.norm(a[k] - a[others[others != k]].mean(axis=0)) / 2  # as `rms_length`
-                found.append((name, ratio, rms, test))
+                test = FactorTest(f"departure of {name}", _OTHERS, int(dof), float(chi2), float(dof), float(p))
+                found.append((name, ratio, np.linalg.norm(away) / 2, test))  # as `rms_length`
     return sorted(found, key=lambda each: -each[1])

@@ -115,9 +115,9 @@ def _of_residuals(solution, problem, blocks, each, night, alarm):
     out, tests = beyond_chance(a, noise, degrees, alarm, fewest=FEWEST), {}
     for k, n in enumerate(owners):
         others = with_others(a, out, k)
-        ratio, chi2, p = (float(value[others == k][0]) for value in compared(a[others], noise[others], degrees))
-        departure = float(np.linalg.norm(a[k] - a[others[others != k]].mean(axis=0)) / 2)
-        tests[n] = NightTest(departure, ratio, chi2, len(degrees), p, bool(p < alarm and ratio > ODD))
+        away, *found = (value[others == k][0] for value in compared(a[others], noise[others], degrees))
+        ratio, chi2, dof, p = map(float, found)
+        tests[n] = NightTest(float(np.linalg.norm(away) / 2), ratio, chi2, dof, p, bool(p < alarm and ratio > ODD))
     return tests
 
 
