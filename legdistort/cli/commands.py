@@ -38,7 +38,7 @@ from .given_files import (
     without_options_of_prior,
 )
 from .repeating import again, repeatable
-from .static_lists import given_static
+from .static_lists import asked_for, given_static
 
 #: What belongs to a reference.
 _TYING = ("reference_error", "reference_degree", "epoch")
@@ -368,8 +368,7 @@ def do_nights(a):
     picture = _picture(found, a)  # refused before the camera is written
     found.write(a.out, date=a.date, value=a.value, overwrite=a.overwrite)
     _write_picture(picture, a)
-    asked = {"date": a.date, found.covariate: a.value}
-    at = ", ".join(f"{name} {number:g}" for name, number in asked.items() if number is not None)
+    at = asked_for(found, a)
     at = f"\n\nThe camera in {a.out} is that of {at}." if at else ""
     figures, inside = found.to_dict(a.date, a.value), _nights_inside(found, a.results)
     if inside is not None:
@@ -419,7 +418,8 @@ def do_correct(a):
         refuse({"epoch": a.epoch, "max_bytes": a.max_bytes}, "is for a solution")
         table, said, figures = static.corrected(a)
     else:
-        refuse({"detector": a.detector}, "is for the lists of a camera")
+        of_camera = {"detector": a.detector, "date": a.date, "value": a.value}
+        refuse(of_camera, "is for the lists of a camera")
         solution, said, figures = _solution(a), "", {}
         lists = [named_as_known(read_given(path, a), path, solution.names) for path in a.tables]
         table = solution.correct_table(stack(lists), epoch=a.epoch)

@@ -9,7 +9,7 @@ from ..exceptions import InputError, some_of
 from ..inputs.star_lists.formats import stack
 from ..inputs.table_files import told_apart
 from ..runtime.asdf_files import entry_of, read_tree
-from .given_files import read_given, without_options_of_prior
+from .given_files import read_given, refuse, without_options_of_prior
 
 #: What the table says of the correction, in its ``meta``.
 _FIGURES = "static_error_px", "exposure_scatter_px"
@@ -80,6 +80,8 @@ def given_static(where, a):
     if Path(where).is_dir() or entry_of(where, ["legdistort"]) is not None:
         return None
     entry = entry_of(where, _OURS)
+    if entry != "legdistort_nights":
+        refuse({"date": a.date, "value": a.value}, "is for a camera of several nights, which legdistort nights writes")
     if entry is None or entry == "legdistort_prior":
         with without_options_of_prior(a):
             return GivenStatic(legdistort.Prior.from_file(where), f"{where}{_written(where, entry)}")
@@ -90,8 +92,16 @@ def given_static(where, a):
     dates = sorted({f"{date:.2f}" for date in (nights.dates.min(), nights.dates.max()) if date})
     count = sum(each.n_nights for each in nights.nights)
     what = f"camera {camera.name} ({where}) of {count} night{'s' * (count > 1)}{', ' * bool(dates)}{' to '.join(dates)}"
-    known = {} if nights.has_focal_plane else {"sigma": nights.prior(one_exposure=True).sigma}
+    if at := asked_for(nights, a):
+        camera, what = nights.camera(a.date, a.value), f"{what}, that of {at}"
+    known = {} if nights.has_focal_plane else {"sigma": nights.prior(a.date, a.value, one_exposure=True).sigma}
     return GivenStatic(camera, what, known)
+
+
+def asked_for(nights, a):
+    """The date and the number of the covariate that a command line asks a camera for, in words; none without them."""
+    asked = {"date": a.date, nights.covariate: a.value}
+    return ", ".join(f"{name} {number:g}" for name, number in asked.items() if number is not None)
 
 
 def _written(where, entry):

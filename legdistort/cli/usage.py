@@ -223,6 +223,7 @@ COMMANDS = {
         options.out("table (.ecsv, .fits, .vot, .xml, .csv, .txt or .dat)"),
         options.COLUMNS,
         options.CARRIED,
+        options.AT_DATE,
     ),
     "report": _command(
         "HTML page of a solution",

@@ -8,9 +8,10 @@ import header_layouts
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import QTable, Table
 from night_sets import SIZE, field
 from numpy.testing import assert_allclose, assert_array_equal
-from rolled_night import modes, night
+from rolled_night import bend, modes, night
 
 import legdistort as ld
 from legdistort.assessment.nights.combined_nights import fitted
@@ -297,6 +298,31 @@ def test_the_command(four, tmp_path, capsys):
     assert_allclose(ld.Prior.from_file(camera).mean, expected.static(value=75.0)[0], atol=1e-9)
     assert main([*line, "--json", "--overwrite"]) == 0
     assert json.loads(capsys.readouterr().out)["covariate"] == KEY
+
+
+@pytest.mark.slow
+def test_lists_are_corrected_by_the_camera_of_a_number(four, combined, tmp_path, capsys):
+    """What `correct` takes off follows the number as the truth does."""
+    camera = combined.write(tmp_path / "camera.asdf", value=75.0)
+    list_, out = tmp_path / "list.ecsv", tmp_path / "out.ecsv"
+    xy = np.random.default_rng(0).uniform(0, SIZE - 1, (50, 2))
+    Table({"x": xy[:, 0], "y": xy[:, 1], "x_err": np.full(50, 0.01), "y_err": np.full(50, 0.01)}).write(list_)
+    taken = {}
+    for number in (None, 75.0, 130.0):
+        line = ["correct", str(camera), str(list_), "--out", str(out), "--overwrite"]
+        assert main(line + ([] if number is None else ["--value", str(number)])) == 0
+        assert (f"that of {KEY} {number or 0:g}" in capsys.readouterr().out) == (number is not None)
+        table = QTable.read(out)
+        taken[number] = np.column_stack([table["x"].value, table["y"].value])
+    assert_allclose(taken[None], taken[75.0], atol=1e-9)
+    true = -(130 - 75) * bend(*xy.T, four.slope)
+    assert np.std(taken[130.0] - taken[75.0] - true) < 0.6 * np.std(true)  # nights scatter by half of it
+    alone = four.solutions[0].write(tmp_path / "one.asdf")
+    assert main(["correct", str(alone), str(list_), "--out", str(out), "--overwrite", "--date", "2020"]) == 1
+    assert "--date is for the lists of a camera" in capsys.readouterr().err
+    plain = combined.camera().write(tmp_path / "plain.asdf")
+    assert main(["correct", str(plain), str(list_), "--out", str(out), "--overwrite", "--date", "2020"]) == 1
+    assert "--date is for a camera of several nights" in capsys.readouterr().err
 
 
 @pytest.mark.slow
