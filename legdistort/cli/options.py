@@ -143,9 +143,7 @@ NIGHTS = {
     "covariate": Option("number of exposures, a column, on which the distortion may depend", metavar="NAME"),
 }
 AT_DATE = {
-    "date": Option(
-        "of a camera of nights, a decimal year (default: of the last one)", type=float, metavar="YEAR"
-    ),
+    "date": Option("of a camera of nights, a decimal year (default: of the last one)", type=float, metavar="YEAR"),
     "value": Option("of its covariate (default: mean of the exposures)", type=float, metavar="NUMBER"),
 }
 REPLACING = {"overwrite": Option("replace a picture that exists", action="store_true")}
