@@ -19,10 +19,11 @@ _WORST = 10  # error of a cell that is drawn, over their median
 _BAND = 0.95
 
 
-def plot_steps(solution, *, scale=None, fig=None):
+def plot_steps(solution, *, scale=None, registered=True, fig=None):
     """Arrows from the mean of each star to its single positions: similarities alone, static part removed, solved.
 
-    The middle panel is there where a static distortion was known. A title has the rms of the arrows per axis.
+    The middle panel is there where a static distortion was known. A title has the rms of the arrows per axis and their
+    magnification, a bar beside it a length in pixels.
 
     Parameters
     ----------
@@ -30,7 +31,9 @@ def plot_steps(solution, *, scale=None, fig=None):
         What is drawn; of motions that were fitted stars are carried to one epoch.
     scale : float, optional
         Magnification, the same in all panels; by default a round number that makes the longest tenth of the arrows of
-        the first a twentieth of the field.
+        a panel a twentieth of the field, the last panel magnified like the one before it.
+    registered : bool
+        False leaves similarities alone out where a static distortion was known.
     fig : `~matplotlib.figure.Figure`, optional
         Where to draw; its size is set.
 
@@ -39,8 +42,11 @@ def plot_steps(solution, *, scale=None, fig=None):
     LegdistortError
         If a distortion folds.
     """
-    steps = {"Shift, rotation and scale only": (_aligned(solution), elements.RED)}
-    if np.any(solution.estimate.prior_mean):
+    known = np.any(solution.estimate.prior_mean)
+    steps = {}
+    if registered or not known:
+        steps["Shift, rotation and scale only"] = _aligned(solution), elements.RED
+    if known:
         steps["Known static distortion removed"] = _aligned(solution, static=True), elements.GREEN
     solved = _at_epoch(solution, lambda name, xy: solution[name].to_reference(xy))
     steps["Every distortion solved"] = _by_star(solution, solved), elements.BLUE
@@ -49,19 +55,27 @@ def plot_steps(solution, *, scale=None, fig=None):
     means = [_mean_positions(positions) for positions, _ in steps.values()]
     away = [positions - mean for (positions, _), mean in zip(steps.values(), means, strict=True)]
     field = (np.nanmax(means[0], axis=0) - np.nanmin(means[0], axis=0)).max()
-    scale = scale or elements.round_down(0.05 * field / (np.nanpercentile(np.hypot(*away[0].T), 90) or 1))
-    for ax, title, mean, off, (_, colour) in zip(panels, steps, means, away, steps.values(), strict=True):
-        _draw_arrows(ax, mean, off, scale, colour)
+    long = [np.nanpercentile(np.hypot(*off.T), 90) for off in away]
+    scales = [scale or elements.round_down(0.05 * field / (each or 1)) for each in long]
+    scales[-1] = scales[-2]  # what the last step does is seen
+    for ax, title, mean, off, (_, colour), by in zip(panels, steps, means, away, steps.values(), scales, strict=True):
+        _draw_arrows(ax, mean, off, by, colour)
         rms = np.sqrt(np.nanmean(off**2))
         ax.set(xlabel="x [px]", aspect="equal")
-        ax.set_title(f"{title}\n{rms:.3f} px rms per axis", loc="left", fontsize="medium")
+        ax.set_title(f"{title}\n{rms:.3f} px rms per axis, × {by:g}", loc="left", fontsize="medium")
     panels[0].set_ylabel("y [px]")
-    key = elements.round_down(0.12 * field / scale)
-    panels[-1].annotate(f"{key:g} px", (1, 1), xycoords="axes fraction", xytext=(-4, 5), textcoords="offset points",
-                        ha="right", fontsize="small")  # fmt: skip
-    panels[-1].plot([1 - key * scale / _width(panels[-1]), 1], [1.01, 1.01], transform=panels[-1].transAxes,
-                    color="black", linewidth=1.5, clip_on=False)  # fmt: skip
+    for ax, by in zip(panels, scales, strict=True):
+        _draw_length(ax, elements.round_down(0.12 * field / by), by)
     return panels
+
+
+def _draw_length(ax, length, scale):
+    """A bar above the right corner as long as this many pixels magnified."""
+    low, high = ax.get_xlim()
+    ax.plot([1 - length * scale / (high - low), 1], [1.01, 1.01], transform=ax.transAxes, color="black", linewidth=1.5,
+            clip_on=False)  # fmt: skip
+    ax.annotate(f"{length:g} px", (1, 1), xycoords="axes fraction", xytext=(-4, 5), textcoords="offset points",
+                ha="right", fontsize="small")  # fmt: skip
 
 
 def _mean_positions(positions):
@@ -70,13 +84,8 @@ def _mean_positions(positions):
     return np.where(number > 0, np.nansum(positions, axis=0) / np.maximum(number, 1), np.nan)
 
 
-def _width(ax):
-    low, high = ax.get_xlim()
-    return high - low
-
-
 def _draw_arrows(ax, mean, off, scale, colour):
-    """Lines from the mean of each star to its positions, magnified, with a point where they end."""
+    """Lines from the mean of each star to its positions, magnified, with a point where they begin."""
     exposure, star = np.nonzero(np.isfinite(off[..., 0]))
     start, end = mean[star], mean[star] + scale * off[exposure, star]
     dense = len(star) > _DENSE

@@ -67,8 +67,8 @@ class Gallery:
             return None
         return self.add(
             panels[0].figure,
-            "From the mean of each star to its position in every exposure, all panels magnified alike: first with what "
-            "registration alone does, last with the distortion of every exposure solved.",
+            "From the mean of each star to its position in every exposure: first with what registration alone does, "
+            "last with the distortion of every exposure solved, magnified like the panel before it.",
             top=0.55,
             wspace=0.04,
         )

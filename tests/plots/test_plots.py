@@ -223,6 +223,32 @@ def test_each_step_of_the_correction_leaves_less(solved):
     assert len(without) == 2
 
 
+def stated_scales(panels):
+    """Magnifications that titles state."""
+    return [float(ax.get_title(loc="left").partition(" × ")[2]) for ax in panels]
+
+
+def test_the_last_step_is_magnified_like_the_one_before_it_and_both_are_seen():
+    """Without that, 0.2 and 0.05 px beside 2 px are dots; the scale is the stated one, and that of the bar."""
+    simulated = simulate_matches(n_stars=60, n_exposures=6, sigma=0.03, dither=300, dynamic=0.1, pose_error=0, seed=5)
+    solution = solve(simulated.matches, prior=Prior(simulated.truth.static))
+    panels = residual_plots.plot_steps(solution)
+    first, static, last = stated_scales(panels)
+    assert 3 * first < static == last
+    for ax, scale in zip(panels, (first, static, last), strict=True):
+        lengths = np.hypot(*np.diff(ends(ax), axis=1)[:, 0].T)
+        if ax is not panels[-1]:
+            assert 0.02 * 2048 < np.percentile(lengths, 90) < 0.05 * 2800
+        rms = float(ax.get_title(loc="left").splitlines()[1].split()[0])
+        assert np.sqrt(np.mean(lengths**2) / 2) == pytest.approx(rms * scale, abs=6e-4 * scale)
+        (bar,), (words,) = ax.lines, ax.texts
+        drawn = np.ptp(bar.get_xdata()) * np.ptp(ax.get_xlim())  # pixels of the picture
+        assert drawn == pytest.approx(float(words.get_text().removesuffix(" px")) * scale)
+    two = residual_plots.plot_steps(solution, registered=False)
+    assert [ax.get_title(loc="left") for ax in two] == [ax.get_title(loc="left") for ax in panels[1:]]
+    assert set(stated_scales(residual_plots.plot_steps(solution, scale=70))) == {70}
+
+
 def test_mean_residuals_are_as_large_as_their_errors_say(solved):
     solution, _ = solved
     ax = residual_plots.plot_mean_residuals(solution, scale=1000)
