@@ -17,6 +17,7 @@ _DENSE = 4000  # arrows beyond which they are pixels
 _CELLS, _PER_CELL = 10, 6  # along the longer side, and observations that a cell needs
 _WORST = 10  # error of a cell that is drawn, over their median
 _BAND = 0.95
+_MOST = 6  # ratio of residuals to expected ones that is drawn
 
 
 def plot_steps(solution, *, scale=None, registered=True, fig=None):
@@ -31,7 +32,7 @@ def plot_steps(solution, *, scale=None, registered=True, fig=None):
         What is drawn; of motions that were fitted stars are carried to one epoch.
     scale : float, optional
         Magnification, the same in all panels; by default a round number that makes the longest tenth of the arrows of
-        a panel a twentieth of the field, the last panel magnified like the one before it.
+        a panel a twentieth of the field at most, the last panel magnified like the one before it.
     registered : bool
         False leaves similarities alone out where a static distortion was known.
     fig : `~matplotlib.figure.Figure`, optional
@@ -56,12 +57,13 @@ def plot_steps(solution, *, scale=None, registered=True, fig=None):
     away = [positions - mean for (positions, _), mean in zip(steps.values(), means, strict=True)]
     field = (np.nanmax(means[0], axis=0) - np.nanmin(means[0], axis=0)).max()
     long = [np.nanpercentile(np.hypot(*off.T), 90) for off in away]
+    long[-2:] = [max(long[-2:])] * 2  # what the last step does is seen
     scales = [scale or elements.round_down(0.05 * field / (each or 1)) for each in long]
-    scales[-1] = scales[-2]  # what the last step does is seen
     for ax, title, mean, off, (_, colour), by in zip(panels, steps, means, away, steps.values(), scales, strict=True):
         _draw_arrows(ax, mean, off, by, colour)
         rms = np.sqrt(np.nanmean(off**2))
         ax.set(xlabel="x [px]", aspect="equal")
+        ax.locator_params(nbins=5)
         ax.set_title(f"{title}\n{rms:.3f} px rms per axis, × {by:g}", loc="left", fontsize="medium")
     panels[0].set_ylabel("y [px]")
     for ax, by in zip(panels, scales, strict=True):
@@ -205,6 +207,8 @@ def _cells(solution):
 def plot_pulls(pulls, *, against="brightness", ax=None):
     """Residuals over their own expected errors, rms of a star or of an exposure, with the band of 95 % around one.
 
+    Marks of more than six are at the upper edge.
+
     Parameters
     ----------
     pulls : `~legdistort.assessment.pulls.Pulls`
@@ -233,15 +237,16 @@ def plot_pulls(pulls, *, against="brightness", ax=None):
         low, high = (np.pad(each, 1, mode="edge") for each in (low, high))
         ax.fill_between(at_band, low, high, color=elements.BLUE, alpha=0.15, linewidth=0, label="95 % by chance")
     ax.axhline(1, color="black", linewidth=0.6)
-    dots = ax.scatter(at, rms, s=16, color=elements.BLUE, linewidths=0, alpha=0.8)
+    top = max(2.2, min(1.05 * np.max(rms, initial=0), _MOST))
+    dots = ax.scatter(at, np.minimum(rms, top), s=16, color=elements.BLUE, linewidths=0, alpha=0.8, clip_on=False)
     dots.set_rasterized(len(shown) > _DENSE)
     if len(shown) <= _DENSE:
         elements.mark(dots, **{"stars" if by_star else "exposures": shown})
     ax.set(xlabel=sums.label, ylabel="rms residual / expected")
     if by_star and np.all(at > 0):
         ax.set_xscale("log")
-    ax.set_ylim(0, max(2.2, min(1.05 * np.max(rms, initial=0), 6)))
-    ax.grid(linewidth=0.3)
+    ax.set_ylim(0, top)
+    elements.set_log_grid(ax)
     ax.legend(fontsize="small", loc="upper right")
     elements.set_title(ax, f"Residuals over expected ones, {'stars by brightness' if by_star else 'exposures in time'}")
     return ax

@@ -18,7 +18,7 @@ from legdistort.assessment.pulls import pulls_of
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis
 from legdistort.matching.matches import Matches
-from legdistort.plots import elements, residual_plots, solution_plots, stack_plots
+from legdistort.plots import elements, motion_plots, residual_plots, solution_plots, stack_plots
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.simulation.observations import simulate_matches
@@ -291,6 +291,29 @@ def test_pulls_are_drawn_by_star_and_by_exposure(solved, against):
     assert dots.get_gid().startswith("marks:s=" if against == "brightness" else "marks:e=")
     with pytest.raises(InputError, match="against must be 'brightness' or 'time', got 'x'"):
         residual_plots.plot_pulls(pulls, against="x")
+
+
+def test_marks_of_what_is_far_off_do_not_shift_those_of_others():
+    """A mark off the picture is none in SVG, or several, and every later one would be named after another star."""
+    rms = np.array([1.0, 40.0, 1.1, 0.9])
+    sums = SimpleNamespace(rms=rms, freedom=np.full(4, 20.0), at=np.array([1.0, 2.0, 4.0, 8.0]), label="flux")
+    ax = residual_plots.plot_pulls(SimpleNamespace(by_star=lambda: sums))
+    (dots,) = [c for c in ax.collections if isinstance(c, PathCollection)]
+    np.testing.assert_array_equal(dots.get_offsets()[:, 1], [1.0, ax.get_ylim()[1], 1.1, 0.9])
+    assert dots.get_gid() == "marks:s=0,1,2,3"
+    ax = stack_plots.plot_mosaic(make_mosaic(300), stars=[[100, 100], [-900, 50], [200, 250], [50, 9e9], [np.nan, 5]])
+    assert ax.collections[0].get_gid() == "marks:s=0,2"
+    np.testing.assert_array_equal(ax.collections[0].get_offsets(), [[100, 100], [200, 250]])
+
+
+def test_points_of_motions_are_marked_with_their_stars():
+    simulated = simulate_matches(n_stars=20, n_exposures=6, degree=1, motion=0.05, dither=100,
+                                 epochs=[2014, 2014.1, 2016, 2016.1, 2018, 2018.1], seed=2)  # fmt: skip
+    solution = solve(simulated.matches, degree=1, motion="proper")
+    for ax in (motion_plots.plot_motions(solution), motion_plots.plot_motion_errors(solution)):
+        (dots,) = [c for c in ax.collections if isinstance(c, PathCollection)]
+        assert dots.get_gid() == "marks:s=" + ",".join(map(str, range(20)))
+        assert len(dots.get_offsets()) == 20
 
 
 def test_mosaic_on_a_slope_shows_its_stars_and_no_empty_bands():
