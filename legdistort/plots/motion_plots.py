@@ -51,7 +51,7 @@ def plot_motions(solution, *, ax=None):
     ax = elements.new_axes(ax, (6.0, 6.0))
     (x, y), (x_err, y_err), labels, _, stars = _columns(solution)
     ax.errorbar(x, y, xerr=x_err, yerr=y_err, fmt="none", ecolor=elements.GREY, elinewidth=0.6)
-    elements.mark(ax.scatter(x, y, s=16, color=elements.BLUE, linewidths=0), stars=stars)
+    elements.mark(ax.scatter(x, y, s=16, color=elements.BLUE, linewidths=0, zorder=3), stars=stars)
     ax.axhline(0, color=elements.GREY, linewidth=0.6)
     ax.axvline(0, color=elements.GREY, linewidth=0.6)
     ax.set(xlabel=labels[0], ylabel=labels[1], aspect="equal")

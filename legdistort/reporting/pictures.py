@@ -184,6 +184,7 @@ class Gallery:
             "Rotation and scale against their mean, size of the dynamic distortion and, where it was measured, the "
             "seeing of every exposure: a drift is a sign of flexure or of the atmosphere.",
             hspace=0.1,
+            left=0.95,
         )
 
     def motions(self, solution):
