@@ -43,7 +43,7 @@ def main():
     save(ld.Camera.gsaoi().plot().figure, "gsaoi_camera.png")
     with tempfile.TemporaryDirectory() as folder:
         night = run_demo(out=Path(folder) / "night")
-        save(plot_steps(night.solution)[0].figure, "before_after.png", colours=256)
+        save(plot_steps(night.solution, registered=False)[0].figure, "before_after.png", colours=256)
         save_report(night.out / "report.html")
         save(stacked(night), "stacks.png", colours=256)
         save(noise(night.out / "frames" / "exp00.fits"), "noise.png")

@@ -30,7 +30,7 @@ from ..geometry.gsaoi import GSAOI_SIZE, GsaoiMap
 from ..inputs import column_contract
 from ..inputs.detector_files import of_files
 from ..runtime.guards.units import plain_numbers
-from ..runtime.notebook import ShownAsPrinted
+from ..runtime.notebook import Heading, ShownAsPrinted, text_of
 from ..runtime.trees import codec
 from ..runtime.trees.facts import SIZE, array, keyed, number
 from . import places as found_places
@@ -385,7 +385,10 @@ class Camera(ShownAsPrinted):
         return f"<Camera {self.name}: {len(self.detectors)} detectors in a focal plane of {nx} x {ny} px>"
 
     def __str__(self) -> str:
-        return "\n".join([repr(self)[1:-1], *self.table_lines()])
+        return text_of(self._parts())
+
+    def _parts(self):
+        return [Heading(repr(self)[1:-1]), *found_places.parts(self)]
 
     def to_dict(self) -> dict[str, Any]:
         """Where the detectors lie as numbers and texts for JSON, None where a layout is exact or nothing is known."""
@@ -407,24 +410,7 @@ class Camera(ShownAsPrinted):
 
         Where nothing is known of that for any detector, a last line says so.
         """
-        places = self.places
-        unknown = all(place.errors is not None and not np.isfinite(place.errors).any() for place in places.values())
-        known = any(place.errors is not None for place in places.values()) and not unknown
-        errors, width = f" {'+-':>8s}" * known, max(10, *map(len, places))
-        lines = [
-            f"{'detector':{width}s} {'size [px]':>13s} {'centre x':>10s}{errors} {'centre y':>10s}{errors} "
-            f"{'rotation':>9s}{errors} {'scale':>9s} {'static':>8s}"
-        ]
-        for key, place in places.items():
-            ny, nx = self[key].shape
-            x, y, rotation = (
-                f" {error:8.2g}" if known else "" for error in (place.errors if place.errors else (0.0, 0.0, 0.0))
-            )
-            lines.append(
-                f"{key:{width}s} {f'{nx} x {ny}':>13s} {place.x:10.2f}{x} {place.y:10.2f}{y} "
-                f"{place.rotation:9.4f}{rotation} {place.scale:9.6f} {self[key].rms:8.3f}"
-            )
-        return lines + ["        errors of the layout: not known"] * unknown
+        return text_of(self._parts()[1:]).splitlines()
 
     @classmethod
     @plain_numbers

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..geometry import basis
 from ..geometry.distortion import Distortion
+from ..runtime.notebook import Column, Fact, Grid
 from .detector import Detector, map_beside, maps_of_plane
 
 
@@ -38,6 +39,29 @@ def places(camera):
         whole = Detector(each.shape, layout=each.layout, static=map_beside(each, each.layout, plane)).placed()
         out[key] = replace(whole.place, errors=tuple(row.tolist()))
     return out
+
+
+def parts(camera):
+    """The table of where detectors lie, with the errors of that where it is not exact, and whether nothing is known."""
+    found = places(camera)
+    unknown = all(place.errors is not None and not np.isfinite(place.errors).any() for place in found.values())
+    known = any(place.errors is not None for place in found.values()) and not unknown
+    sizes = [" x ".join(map(str, camera[key].shape[::-1])) for key in found]
+    columns = [
+        Column("detector", list(found), max(10, *map(len, found)), words=True),
+        Column("size [px]", sizes, 13),
+    ]
+    for k, (head, name, size, digits) in enumerate(_PLACE):
+        columns.append(Column(head, [f"{getattr(place, name):.{digits}f}" for place in found.values()], size))
+        if known:
+            errors = [f"{place.errors[k] if place.errors else 0.0:.2g}" for place in found.values()]
+            columns.append(Column("+-", errors, 8))
+    columns.append(Column("scale", [f"{place.scale:.6f}" for place in found.values()], 9))
+    columns.append(Column("static", [f"{camera[key].rms:.3f}" for key in found], 8))
+    return [Grid(columns), Fact("", "errors of the layout: not known" * unknown)]
+
+
+_PLACE = ("centre x", "x", 10, 2), ("centre y", "y", 10, 2), ("rotation", "rotation", 9, 4)
 
 
 def relative_errors(camera, covariance):

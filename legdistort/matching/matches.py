@@ -22,7 +22,7 @@ from ..inputs.detector_files import with_ids_of
 from ..results.errors.header_pointing import HeaderPointing
 from ..runtime.checks import check_choice
 from ..runtime.guards.units import plain_numbers
-from ..runtime.notebook import ShownAsPrinted
+from ..runtime.notebook import Column, Fact, Grid, Heading, ShownAsPrinted
 from .fields import apart, estimated, joined, side_by_side
 
 if TYPE_CHECKING:
@@ -406,6 +406,14 @@ class Matches(ShownAsPrinted):
         exposures = f"{len(self.names)} exposure{'s' * (len(self.names) != 1)}"
         counts = f"{len(self.table)} observations of {len(self.stars)} stars in {exposures}"
         return f"<Matches: {counts}{of_fields}>"
+
+    def _parts(self):
+        poses = [similarity.describe(self.poses[name]) for name in self.names]
+        shown = {"dx [px]": ("dx", 2), "dy [px]": ("dy", 2), "rotation [deg]": ("rotation", 4), "scale": ("scale", 6)}
+        columns = [Column(head, [f"{each[key]:.{n}f}" for each in poses]) for head, (key, n) in shown.items()]
+        stars = Column("stars", list(map(str, np.bincount(self.observations.exposure))))
+        table = Grid([Column("exposure", self.names, words=True), stars, *columns])
+        return [Heading(repr(self)[1:-1]), table, Fact("left out", reasons_of(self.left_out))]
 
     @classmethod
     def of_fields(cls, fields: Mapping[str, Matches]) -> Matches:

@@ -50,7 +50,7 @@ def set_log_grid(ax):
     """Grid, and labels at 1, 2, 5 where a logarithmic axis is short, at powers of ten where it is long."""
     from matplotlib import ticker
 
-    for axis in (ax.xaxis, ax.yaxis):
+    for axis in (each for each in (ax.xaxis, ax.yaxis) if each.get_scale() == "log"):
         low, high = axis.get_view_interval()
         axis.set_minor_formatter(ticker.NullFormatter())
         if high < 300 * low:

@@ -14,7 +14,7 @@ _SKY = (("pmra", "pmra_error"), ("pmdec", "pmdec_error"))
 
 
 def _columns(solution):
-    """Motions and their relative errors, (2, n) each, of stars that have them; names and unit of the axes; the table.
+    """Motions and relative errors (2, n) of stars that have them; names and unit of the axes; the table; which stars.
 
     Raises
     ------
@@ -28,7 +28,7 @@ def _columns(solution):
     values, errors = (np.stack([table[pair[k]].to_value(unit) for pair in names]) for k in (0, 1))
     good = np.isfinite(values).all(axis=0)
     labels = [f"{pair[0]} [{'px' if solution.sky is None else 'mas'}/yr]" for pair in names]
-    return values[:, good], errors[:, good], labels, table[good]
+    return values[:, good], errors[:, good], labels, table[good], np.flatnonzero(good)
 
 
 def plot_motions(solution, *, ax=None):
@@ -49,9 +49,9 @@ def plot_motions(solution, *, ax=None):
         If they were not.
     """
     ax = elements.new_axes(ax, (6.0, 6.0))
-    (x, y), (x_err, y_err), labels, _ = _columns(solution)
+    (x, y), (x_err, y_err), labels, _, stars = _columns(solution)
     ax.errorbar(x, y, xerr=x_err, yerr=y_err, fmt="none", ecolor=elements.GREY, elinewidth=0.6)
-    ax.plot(x, y, "o", color=elements.BLUE, markersize=4, mew=0)
+    elements.mark(ax.scatter(x, y, s=16, color=elements.BLUE, linewidths=0, zorder=3), stars=stars)
     ax.axhline(0, color=elements.GREY, linewidth=0.6)
     ax.axvline(0, color=elements.GREY, linewidth=0.6)
     ax.set(xlabel=labels[0], ylabel=labels[1], aspect="equal")
@@ -69,16 +69,17 @@ def plot_motion_errors(solution, *, ax=None):
     Parameters and errors are those of `plot_motions`.
     """
     ax = elements.new_axes(ax, (6.4, 5.6))
-    _, errors, labels, table = _columns(solution)
+    _, errors, labels, table, stars = _columns(solution)
     size = np.sqrt(np.mean(errors**2, axis=0))
     flux = np.asarray(table["flux"], dtype=float) if "flux" in table.colnames else np.full(len(table), np.nan)
     if np.any(flux > 0):
-        ax.loglog(flux[flux > 0], size[flux > 0], "o", color=elements.BLUE, markersize=4, mew=0)
-        elements.set_log_grid(ax)
-        ax.set(xlabel="flux [unit of the input]")
+        stars, at, size = stars[flux > 0], flux[flux > 0], size[flux > 0]
+        ax.set(xlabel="flux [unit of the input]", xscale="log", yscale="log")
     else:
-        ax.semilogy(np.asarray(table["n"]), size, "o", color=elements.BLUE, markersize=4, mew=0)
-        ax.set(xlabel="observations used")
+        at = np.asarray(table["n"])
+        ax.set(xlabel="observations used", yscale="log")
+    elements.mark(ax.scatter(at, size, s=16, color=elements.BLUE, linewidths=0), stars=stars)
+    elements.set_log_grid(ax)
     ax.set(ylabel=f"error per axis {labels[0].partition(' ')[2]}")
     elements.set_title(ax, "Errors of proper motions")
     return ax

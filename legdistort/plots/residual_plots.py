@@ -17,12 +17,14 @@ _DENSE = 4000  # arrows beyond which they are pixels
 _CELLS, _PER_CELL = 10, 6  # along the longer side, and observations that a cell needs
 _WORST = 10  # error of a cell that is drawn, over their median
 _BAND = 0.95
+_MOST = 6  # ratio of residuals to expected ones that is drawn
 
 
-def plot_steps(solution, *, scale=None, fig=None):
+def plot_steps(solution, *, scale=None, registered=True, fig=None):
     """Arrows from the mean of each star to its single positions: similarities alone, static part removed, solved.
 
-    The middle panel is there where a static distortion was known. A title has the rms of the arrows per axis.
+    The middle panel is there where a static distortion was known. A title has the rms of the arrows per axis and their
+    magnification, a bar beside it a length in pixels.
 
     Parameters
     ----------
@@ -30,7 +32,9 @@ def plot_steps(solution, *, scale=None, fig=None):
         What is drawn; of motions that were fitted stars are carried to one epoch.
     scale : float, optional
         Magnification, the same in all panels; by default a round number that makes the longest tenth of the arrows of
-        the first a twentieth of the field.
+        a panel a twentieth of the field at most, the last panel magnified like the one before it.
+    registered : bool
+        False leaves similarities alone out where a static distortion was known.
     fig : `~matplotlib.figure.Figure`, optional
         Where to draw; its size is set.
 
@@ -39,8 +43,11 @@ def plot_steps(solution, *, scale=None, fig=None):
     LegdistortError
         If a distortion folds.
     """
-    steps = {"Shift, rotation and scale only": (_aligned(solution), elements.RED)}
-    if np.any(solution.estimate.prior_mean):
+    known = np.any(solution.estimate.prior_mean)
+    steps = {}
+    if registered or not known:
+        steps["Shift, rotation and scale only"] = _aligned(solution), elements.RED
+    if known:
         steps["Known static distortion removed"] = _aligned(solution, static=True), elements.GREEN
     solved = _at_epoch(solution, lambda name, xy: solution[name].to_reference(xy))
     steps["Every distortion solved"] = _by_star(solution, solved), elements.BLUE
@@ -49,19 +56,28 @@ def plot_steps(solution, *, scale=None, fig=None):
     means = [_mean_positions(positions) for positions, _ in steps.values()]
     away = [positions - mean for (positions, _), mean in zip(steps.values(), means, strict=True)]
     field = (np.nanmax(means[0], axis=0) - np.nanmin(means[0], axis=0)).max()
-    scale = scale or elements.round_down(0.05 * field / (np.nanpercentile(np.hypot(*away[0].T), 90) or 1))
-    for ax, title, mean, off, (_, colour) in zip(panels, steps, means, away, steps.values(), strict=True):
-        _draw_arrows(ax, mean, off, scale, colour)
+    long = [np.nanpercentile(np.hypot(*off.T), 90) for off in away]
+    long[-2:] = [max(long[-2:])] * 2  # what the last step does is seen
+    scales = [scale or elements.round_down(0.05 * field / (each or 1)) for each in long]
+    for ax, title, mean, off, (_, colour), by in zip(panels, steps, means, away, steps.values(), scales, strict=True):
+        _draw_arrows(ax, mean, off, by, colour)
         rms = np.sqrt(np.nanmean(off**2))
         ax.set(xlabel="x [px]", aspect="equal")
-        ax.set_title(f"{title}\n{rms:.3f} px rms per axis", loc="left", fontsize="medium")
+        ax.locator_params(nbins=5)
+        ax.set_title(f"{title}\n{rms:.3f} px rms per axis, × {by:g}", loc="left", fontsize="medium")
     panels[0].set_ylabel("y [px]")
-    key = elements.round_down(0.12 * field / scale)
-    panels[-1].annotate(f"{key:g} px", (1, 1), xycoords="axes fraction", xytext=(-4, 5), textcoords="offset points",
-                        ha="right", fontsize="small")  # fmt: skip
-    panels[-1].plot([1 - key * scale / _width(panels[-1]), 1], [1.01, 1.01], transform=panels[-1].transAxes,
-                    color="black", linewidth=1.5, clip_on=False)  # fmt: skip
+    for ax, by in zip(panels, scales, strict=True):
+        _draw_length(ax, elements.round_down(0.12 * field / by), by)
     return panels
+
+
+def _draw_length(ax, length, scale):
+    """A bar above the right corner as long as this many pixels magnified."""
+    low, high = ax.get_xlim()
+    ax.plot([1 - length * scale / (high - low), 1], [1.01, 1.01], transform=ax.transAxes, color="black", linewidth=1.5,
+            clip_on=False)  # fmt: skip
+    ax.annotate(f"{length:g} px", (1, 1), xycoords="axes fraction", xytext=(-4, 5), textcoords="offset points",
+                ha="right", fontsize="small")  # fmt: skip
 
 
 def _mean_positions(positions):
@@ -70,13 +86,8 @@ def _mean_positions(positions):
     return np.where(number > 0, np.nansum(positions, axis=0) / np.maximum(number, 1), np.nan)
 
 
-def _width(ax):
-    low, high = ax.get_xlim()
-    return high - low
-
-
 def _draw_arrows(ax, mean, off, scale, colour):
-    """Lines from the mean of each star to its positions, magnified, with a point where they end."""
+    """Lines from the mean of each star to its positions, magnified, with a point where they begin."""
     exposure, star = np.nonzero(np.isfinite(off[..., 0]))
     start, end = mean[star], mean[star] + scale * off[exposure, star]
     dense = len(star) > _DENSE
@@ -196,6 +207,8 @@ def _cells(solution):
 def plot_pulls(pulls, *, against="brightness", ax=None):
     """Residuals over their own expected errors, rms of a star or of an exposure, with the band of 95 % around one.
 
+    Marks of more than six are at the upper edge.
+
     Parameters
     ----------
     pulls : `~legdistort.assessment.pulls.Pulls`
@@ -224,15 +237,16 @@ def plot_pulls(pulls, *, against="brightness", ax=None):
         low, high = (np.pad(each, 1, mode="edge") for each in (low, high))
         ax.fill_between(at_band, low, high, color=elements.BLUE, alpha=0.15, linewidth=0, label="95 % by chance")
     ax.axhline(1, color="black", linewidth=0.6)
-    dots = ax.scatter(at, rms, s=16, color=elements.BLUE, linewidths=0, alpha=0.8)
+    top = max(2.2, min(1.05 * np.max(rms, initial=0), _MOST))
+    dots = ax.scatter(at, np.minimum(rms, top), s=16, color=elements.BLUE, linewidths=0, alpha=0.8, clip_on=False)
     dots.set_rasterized(len(shown) > _DENSE)
     if len(shown) <= _DENSE:
         elements.mark(dots, **{"stars" if by_star else "exposures": shown})
     ax.set(xlabel=sums.label, ylabel="rms residual / expected")
     if by_star and np.all(at > 0):
         ax.set_xscale("log")
-    ax.set_ylim(0, max(2.2, min(1.05 * np.max(rms, initial=0), 6)))
-    ax.grid(linewidth=0.3)
+    ax.set_ylim(0, top)
+    elements.set_log_grid(ax)
     ax.legend(fontsize="small", loc="upper right")
     elements.set_title(ax, f"Residuals over expected ones, {'stars by brightness' if by_star else 'exposures in time'}")
     return ax

@@ -142,7 +142,7 @@ def plot_distortions(solution, *, names=None, page=0, part="total", scale=50, fi
         elements.mark(ax, exposures=[solution.names.index(name)])
         elements.set_title(ax, elements.shorten(name, 26), size="small")
         ax.set(xlabel="", ylabel="")
-        ax.tick_params(labelsize="x-small")
+        ax.tick_params(labelsize="small")
         ax.locator_params(nbins=3)
         if i % columns:
             ax.set_yticks([])

@@ -38,12 +38,12 @@ def plot_mosaic(mosaic, *, stars=None, max_size=900, ax=None):
     height, width = (block * n for n in image.shape)
     extent = (-0.5, width - 0.5, -0.5, height - 0.5)
     elements.draw_image(ax, image, sky=sky, soft=soft, low=low, high=high, extent=extent)
+    limits = np.array([_covered(image, axis, block) for axis in (0, 1)])
     if stars is not None:
-        x, y = np.asarray(stars, dtype=float).T
-        dots = ax.scatter(x, y, s=81, facecolors="none", edgecolors=elements.RED, linewidths=0.9)
-        seen = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+        stars = np.asarray(stars, dtype=float)
+        seen = np.flatnonzero(((stars > limits[:, 0]) & (stars < limits[:, 1])).all(axis=1))
+        dots = ax.scatter(*stars[seen].T, s=81, facecolors="none", edgecolors=elements.RED, linewidths=0.9)
         elements.mark(dots, stars=seen)
-    limits = [_covered(image, axis, block) for axis in (0, 1)]
     ax.set(xlim=limits[0], ylim=limits[1], xlabel="x [px]", ylabel="y [px]")
     elements.set_title(ax, "Mosaic less its smooth sky (asinh stretch)")
     return ax
@@ -142,7 +142,7 @@ def _draw_row(axes, zoom):
             ax.contour(x, y, np.nan_to_num(image - sky), levels=[own / 2], colors=elements.ORANGE, linewidths=1.3)
         label = f"FWHM {zoom.fwhm[name]:.2f} px" if np.isfinite(zoom.fwhm[name]) else "no fit"
         ax.annotate(label, (0.04, 0.04), xycoords="axes fraction", fontsize="small", color=elements.BLUE, bbox=_PLAIN)
-        ax.tick_params(labelsize="x-small")
+        ax.tick_params(labelsize="small")
     x, y = zoom.place
     axes[0].set_ylabel(f"star at {x:.0f}, {y:.0f}\ny from it [px]", fontsize="small")
 

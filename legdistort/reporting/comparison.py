@@ -33,13 +33,18 @@ def plot_comparison(solutions, *, noise=None, ax=None):
         Where to draw.
     """
     ax = elements.new_axes(ax, (7.0, 5.0))
+    known = solutions[baselines.METHOD].estimate.star_names if baselines.METHOD in solutions else ()
     for (name, solution), spare in zip(solutions.items(), "Dv<>*" * len(solutions), strict=False):
         flux, error, label = _abscissa(solution)
         sigma = accuracy.scatter(accuracy.corrected_positions(solution))
         figures = accuracy.scatter_summary(solution)
         colour, marker = STYLES.get(name, ("#CC79A7", spare))
         text = f"{name}: {figures['mean']:.3f} ± {figures['std']:.3f} px"
-        ax.plot(flux, sigma, marker, color=colour, markersize=5, alpha=0.8, mew=1.3 if marker == "x" else 0, label=text)
+        seen = np.flatnonzero(np.isfinite(flux) & (sigma > 0))
+        marks = ax.scatter(flux[seen], sigma[seen], s=25, marker=marker, color=colour, alpha=0.8, label=text,
+                           linewidths=1.3 if marker == "x" else 0)  # fmt: skip
+        if np.array_equal(solution.estimate.star_names, known):
+            elements.mark(marks, stars=seen)
     if noise is None:
         good = np.isfinite(sigma)
         at, curve = elements.running_median(flux[good], error[good])

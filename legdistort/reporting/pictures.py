@@ -67,8 +67,8 @@ class Gallery:
             return None
         return self.add(
             panels[0].figure,
-            "From the mean of each star to its position in every exposure, all panels magnified alike: first with what "
-            "registration alone does, last with the distortion of every exposure solved.",
+            "From the mean of each star to its position in every exposure: first with what registration alone does, "
+            "last with the distortion of every exposure solved, magnified like the panel before it.",
             top=0.55,
             wspace=0.04,
         )
@@ -184,6 +184,7 @@ class Gallery:
             "Rotation and scale against their mean, size of the dynamic distortion and, where it was measured, the "
             "seeing of every exposure: a drift is a sign of flexure or of the atmosphere.",
             hspace=0.1,
+            left=0.95,
         )
 
     def motions(self, solution):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import textwrap
 from dataclasses import dataclass, field
 from math import isfinite
 
 from scipy import special
 
-from ..runtime.notebook import ShownAsPrinted
+from ..runtime.notebook import Column, Fact, Grid, ShownAsPrinted
 from ..runtime.trees.facts import number, text
 
 #: Probability with which a check warns of a set in which nothing is wrong; all of them together make 2 %.
@@ -94,8 +93,28 @@ class Check(ShownAsPrinted):
         wrong = self.state == "fail" or (self.name == "extrapolation" and self.state in WRONG)
         return wrong and not (self.exposures and names.isdisjoint(self.exposures))
 
+    @property
+    def _words(self) -> str:
+        """What was found, and what to do about it."""
+        return f"{self.sentence}{'; ' * bool(self.cure)}{self.cure}"
+
     def __str__(self) -> str:
-        return f"{self.state:7s} {self.name}: {self.sentence}{'; ' * bool(self.cure)}{self.cure}"
+        return f"{self.state:7s} {self.name}: {self._words}"
+
+    def _parts(self):
+        return Checks([self])._parts()
+
+
+class Checks(tuple[Check, ...], ShownAsPrinted):
+    """Checks of a result: a tuple, which a notebook shows as a table, the worst first."""
+
+    __slots__ = ()
+
+    def _parts(self):
+        rows = _worst_first(self)
+        columns = {"check": "name", "state": "state", "what was found": "sentence", "what to do": "cure"}
+        shown = [Column(head, [getattr(c, key) for c in rows], words=True) for head, key in columns.items()]
+        return [Grid(shown if any(c.cure for c in rows) else shown[:-1])]
 
 
 def state_of(p, matters=True):
@@ -108,22 +127,12 @@ def worst(checks):
     return max((check.state for check in checks), key=STATES.index, default="pass")
 
 
-def in_lines(checks, *, width=110):
-    """A line for what passes, and one for each check that does not, the worst first.
-
-    Parameters
-    ----------
-    checks : iterable of Check
-    width : int
-        Characters of a line.
-
-    Returns
-    -------
-    list of str
-    """
-    checks = tuple(checks)
-    open_ones = sorted((c for c in checks if c.state != "pass"), key=lambda c: -STATES.index(c.state))
+def in_facts(checks):
+    """A `Fact` of what passes, and one for each check that does not, the worst first."""
     passed = [c.name for c in checks if c.state == "pass"]
-    lines = [f"checks  {len(passed)} of {len(checks)} pass" + (f": {', '.join(passed)}" if passed else "")]
-    lines += [str(check) for check in open_ones]
-    return [part for line in lines for part in textwrap.wrap(line, width, subsequent_indent=" " * 8)]
+    first = Fact("checks", f"{len(passed)} of {len(checks)} pass" + (f": {', '.join(passed)}" if passed else ""))
+    return [first, *(Fact(c.state, f"{c.name}: {c._words}") for c in _worst_first(checks) if c.state != "pass")]
+
+
+def _worst_first(checks):
+    return sorted(checks, key=lambda check: -STATES.index(check.state))

@@ -1,6 +1,4 @@
-"""A solution in tables and words: its stars, and what `print` shows of it."""
-
-import textwrap
+"""A solution in tables and words: its stars, and what `print` and notebooks show of it."""
 
 import numpy as np
 from astropy import units as u
@@ -14,10 +12,11 @@ from ..exceptions import by_reason, some_of
 from ..geometry import basis
 from ..geometry.epochs import year
 from ..inputs import column_contract
+from ..runtime.notebook import Column, Fact, Grid, Heading, Sentence
 from ..runtime.words import UNSTATED
 from . import accuracy, new_positions, nights
 from . import motions as star_motions
-from .check import in_lines
+from .check import in_facts
 from .errors import absolute_errors, common_maps, pose_errors
 
 
@@ -282,60 +281,59 @@ def goodness(fit):
     return f"chi2 {fit.chi2:.1f} for {fit.dof:.0f} degrees of freedom"
 
 
-def printed(solution):
-    """What `print` shows: verdict, facts, a row for every exposure."""
-    used, motions = solution.residuals["used"], solution.estimate.motions
+def parts(solution):
+    """What `print` and a notebook show: verdict, facts, a row for every exposure."""
+    used, motions, n = solution.residuals["used"], solution.estimate.motions, len(solution.residuals)
     both = rms(solution)
-    lines = [
-        repr(solution)[1:-1],
-        *in_lines(solution.checks),
-        f"status  {solution.status}",
-        *_wrapped("camera", camera_sentence(solution)),
-        *_wrapped("fields", _fields_in_words(solution)),
-        *_static_in_words(solution),
-        *_wrapped("odd", next((c.sentence for c in solution.checks if c.name == "dynamic part" and c.tests), "")),
-        *_wrapped("gauge", solution.gauge.sentence),
-        *_wrapped("sky", sky_sentence(solution)),
-        *(_wrapped("stars", motions.sentence) if motions is not None else []),
-        f"rms     {both[0]:.4f}, {both[1]:.4f} px in x, y; {np.count_nonzero(used)} of {len(used)} observations used",
-        *_wrapped("angles", mas_sentence(solution)),
-        *(line for key, text in solution.diagnostics.in_words().items() for line in _wrapped(key, text)),
-        "",
-        *_exposure_lines(solution),
+    facts = {
+        "status": solution.status,
+        "camera": camera_sentence(solution),
+        "fields": _fields_in_words(solution),
+        "static": _static_in_words(solution),
+        "odd": next((c.sentence for c in solution.checks if c.name == "dynamic part" and c.tests), ""),
+        "gauge": solution.gauge.sentence,
+        "sky": sky_sentence(solution),
+        "stars": motions.sentence if motions is not None else "",
+        "rms": f"{both[0]:.4f}, {both[1]:.4f} px in x, y; {np.count_nonzero(used)} of {n} observations used",
+        "angles": mas_sentence(solution),
+    }
+    out = [
+        Heading(repr(solution)[1:-1]),
+        *in_facts(solution.checks),
+        *(Fact(*each) for each in (*facts.items(), *solution.diagnostics.in_words().items())),
+        Sentence(),
+        *_exposure_parts(solution),
+        *nights.parts(solution),
     ]
-    lines += nights.lines(solution)
     if solution.camera.has_focal_plane:
-        lines += ["", *solution.camera.table_lines(), *_wrapped("", layout_errors(solution))]
-    lines += [f"left out {some_of(names, 6)}: {reason}" for reason, names in by_reason(solution.left_out).items()]
-    return "\n".join(lines)
+        out += [Sentence(), *places.parts(solution.camera), Fact("", layout_errors(solution))]
+    left_out = by_reason(solution.left_out).items()
+    return out + [Sentence(f"left out {some_of(names, 6)}: {reason}") for reason, names in left_out]
 
 
-def _exposure_lines(solution):
-    """Lines of the printed table of the exposures: names, units, one each, and how well the poses are known."""
+def _exposure_parts(solution):
+    """The table of the exposures, and how well their poses are known."""
     numbers = pose_errors.pose_numbers(solution)
     distortion, dynamic = accuracy.sizes(solution)
-    table, names = solution.residuals, ["exposure", "", *solution.names]
+    table = solution.residuals
     used = [table[table["used"] & (table["exposure"] == name)] for name in solution.names]
     rms = [[np.sqrt(np.mean(rows[k].to_value(u.pix) ** 2)) if len(rows) else np.nan for rows in used] for k in _RMS]
 
-    def pose(name):
-        return [each.text(name) for each in numbers]
+    def pose(head, name, unit=""):
+        return Column(head, [each.text(name) for each in numbers], 9, unit)
 
     columns = [
-        (5, "stars", "", [str(len(rows)) for rows in used]),
-        (9, "shift x", "px", pose("dx")), (9, "shift y", "px", pose("dy")),
-        (9, "rotation", "deg", pose("rotation")), (9, "scale", "", pose("scale")),
-        (7, "rms x", "px", [f"{each:.4f}" for each in rms[0]]), (7, "rms y", "px", [f"{each:.4f}" for each in rms[1]]),
-        (8, "dynamic", "px", [f"{each:.3f}" for each in dynamic]),
-        (10, "distortion", "px", [f"{each:.3f}" for each in distortion]),
+        Column("exposure", solution.names, max(16, *map(len, solution.names)), words=True),
+        Column("stars", [str(len(rows)) for rows in used], 5),
+        pose("shift x", "dx", "px"), pose("shift y", "dy", "px"), pose("rotation", "rotation", "deg"),
+        pose("scale", "scale"),
+        *(Column(f"rms {axis}", [f"{each:.4f}" for each in rms[k]], 7, "px") for k, axis in enumerate("xy")),
+        Column("dynamic", [f"{each:.3f}" for each in dynamic], 8, "px"),
+        Column("distortion", [f"{each:.3f}" for each in distortion], 10, "px"),
     ]  # fmt: skip
     if solution.sky is not None:
-        columns += [(9, "PA", "deg", pose("position_angle")), (9, "scale", "arcsec/px", pose("pixel_scale"))]
-    width = max(16, *map(len, names))
-    lines = [f"{name:{width}s}" for name in names]
-    for size, *texts in ((size, head, unit, *rows) for size, head, unit, rows in columns):
-        lines = [f"{line} {text:>{size}s}" for line, text in zip(lines, texts, strict=True)]
-    return [*lines, *_wrapped("poses", pose_errors.in_words(numbers))]
+        columns += [pose("PA", "position_angle", "deg"), pose("scale", "pixel_scale", "arcsec/px")]
+    return [Grid(columns), Fact("poses", pose_errors.in_words(numbers))]
 
 
 _RMS = "dx", "dy"
@@ -380,12 +378,7 @@ def _fields_in_words(solution):
 
 def _static_in_words(solution):
     if solution.settings.static != "fit" or solution.camera.has_focal_plane:
-        return []
+        return ""
     own = solution.settings.exposure_degree
     mine = f"modes up to degree {own}" if own else "its pose alone"
-    return [f"static  fitted: one distortion for all exposures of a detector, {mine} for every exposure"]
-
-
-def _wrapped(key, text):
-    """Lines of at most 110 characters that begin with a key; none for no text."""
-    return textwrap.wrap(text, 110, initial_indent=f"{key:8s}", subsequent_indent=" " * 8) if text else []
+    return f"fitted: one distortion for all exposures of a detector, {mine} for every exposure"

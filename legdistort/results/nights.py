@@ -9,6 +9,7 @@ from astropy import units as u
 from astropy.table import QTable
 
 from ..inputs import column_contract
+from ..runtime.notebook import Column, Grid, Sentence, text_of
 from ..runtime.trees.facts import array, number
 
 
@@ -144,32 +145,37 @@ class NightsTable(QTable):
     """Nights, printed with what counts in the width of a terminal: lists of exposures are as long as nights are."""
 
     def __str__(self) -> str:
-        return "\n".join(_lines(self)) if {"name", *_SHOWN, "odd"} <= set(self.colnames) else super().__str__()
+        return text_of([_grid(self)]) if {"name", *_SHOWN, "odd"} <= set(self.colnames) else super().__str__()
 
 
 _SHOWN = "n_exposures", "n_stars", "rms", "rms_ratio", "departure", "ratio", "dof", "p"
 
 
-def lines(solution):
+def parts(solution):
     """What `print` of a solution shows of them; nothing of a single one."""
     nights = solution.nights
-    return ["", *_lines(nights)] if len(nights) > 1 else []
+    return [Sentence(), _grid(nights)] if len(nights) > 1 else []
 
 
-def _lines(nights):
-    width = max([10, *map(len, nights["name"])])
-    out = [
-        f"{'night':{width}s} {'exposures':>9s} {'stars':>5s} {'rms':>7s} {'rms/error':>9s} {'departure':>9s} "
-        f"{'ratio':>6s} {'p':>8s}",
-        f"{'px':>{width + 24}s} {'px length':>19s}",
+def _grid(nights):
+    known = nights["dof"] > 0
+
+    def column(name, head, size, form, unit="", where=None):
+        texts = [f"{value:{form}}" for value in np.asarray(nights[name])]
+        return Column(head, texts if where is None else np.where(known, texts, where).tolist(), size, unit)
+
+    columns = [
+        Column("night", list(nights["name"]), max([10, *map(len, nights["name"])]), words=True),
+        column("n_exposures", "exposures", 9, "d"),
+        column("n_stars", "stars", 5, "d"),
+        column("rms", "rms", 7, ".4f", "px"),
+        column("rms_ratio", "rms/error", 9, ".3f"),
+        column("departure", "departure", 9, ".4f", "px length", "-"),
+        column("ratio", "ratio", 6, ".2f", where=""),
+        column("p", "p", 8, ".2g", where=""),
+        Column("", [" odd" * bool(odd) for odd in nights["odd"]], words=True),
     ]
-    for row in nights:
-        departure = f"{row['departure'].value:9.4f} {row['ratio']:6.2f} {row['p']:8.2g}" if row["dof"] else f"{'-':>9s}"
-        out.append(
-            f"{row['name']:{width}s} {row['n_exposures']:9d} {row['n_stars']:5d} {row['rms'].value:7.4f} "
-            f"{row['rms_ratio']:9.3f} {departure}{'  odd' * bool(row['odd'])}"
-        )
-    return out
+    return Grid(columns)
 
 
 def _rms(values):

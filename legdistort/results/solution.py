@@ -15,8 +15,9 @@ from ..cameras.camera import Camera
 from ..geometry.tangent_plane import TangentPlane
 from ..plots import residual_plots
 from ..runtime.guards.units import plain_numbers
-from ..runtime.notebook import ShownAsPrinted
+from ..runtime.notebook import ShownAsPrinted, text_of
 from . import in_tables, new_positions, nights
+from .check import Checks
 from .diagnostics import Diagnostics
 from .errors import absolute_errors
 from .estimate import Estimate, plain_covariances
@@ -155,7 +156,7 @@ class Solution(ShownAsPrinted):
     @cached_property
     def checks(self) -> tuple[Check, ...]:
         """Tests of the solution with their results: a tuple of `legdistort.results.check.Check`; made at first use."""
-        return self.estimate.checked(self) if callable(self.estimate.checked) else self.estimate.checked
+        return Checks(self.estimate.checked(self) if callable(self.estimate.checked) else self.estimate.checked)
 
     @cached_property
     def factors(self) -> QTable:
@@ -332,7 +333,10 @@ class Solution(ShownAsPrinted):
         return f"<Solution: {exposures}, {stars}, degree {self.degree}, {in_tables.goodness(self)}>"
 
     def __str__(self) -> str:
-        return in_tables.printed(self)
+        return text_of(self._parts())
+
+    def _parts(self):
+        return in_tables.parts(self)
 
     # -- files
 

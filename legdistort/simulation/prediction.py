@@ -21,7 +21,7 @@ from ..results.errors.absolute_errors import absolute_blocks, relative_blocks
 from ..results.solution import Solution
 from ..runtime.checks import check_positive
 from ..runtime.guards.units import plain_numbers
-from ..runtime.notebook import ShownAsPrinted
+from ..runtime.notebook import ShownAsPrinted, text_of
 from ..solving import star_motions
 from ..solving.equations.problem import build_problem
 from ..solving.options import SolveOptions
@@ -29,7 +29,7 @@ from . import magnitudes
 from .aliasing import alias, assumed_spectra
 from .noiseless_solution import noiseless_solution
 from .plan import Plan, lay_out
-from .prediction_text import decimals, describe, finite_rms, unit_of
+from .prediction_text import decimals, finite_rms, parts, unit_of
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -293,7 +293,10 @@ class Prediction(ShownAsPrinted):
         )
 
     def __str__(self) -> str:
-        return describe(self)
+        return text_of(self._parts())
+
+    def _parts(self):
+        return parts(self)
 
 
 @plain_numbers

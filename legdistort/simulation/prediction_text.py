@@ -1,8 +1,10 @@
-"""Predictions as text."""
+"""Predictions as text and tables."""
 
-import textwrap
+from itertools import zip_longest
 
 import numpy as np
+
+from ..runtime.notebook import Column, Grid, Heading, Sentence
 
 _MOTIONS = {"motion": "proper motions, relative [{}/yr]", "motion_abs": "proper motions, absolute [{}/yr]"}
 _MOTIONS |= {"parallax": "parallaxes, relative [{}]", "parallax_abs": "parallaxes, absolute [{}]"}
@@ -25,14 +27,32 @@ def finite_rms(values):
     return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
 
 
-def describe(prediction):
-    """A `Prediction` as ``print`` shows it: both criteria, aliasing where any is assumed, slopes and rules of thumb."""
+def parts(prediction):
+    """A `Prediction` as it is shown: both criteria, aliasing where any is assumed, slopes and rules of thumb."""
     solution, instrument = prediction.solution, prediction.settings.instrument
     ny, nx = solution.estimate.shapes[solution.names[0]]
     low, high = prediction.stars_per_exposure.min(), prediction.stars_per_exposure.max()
+    unit, scale = unit_of(prediction)
+    return [
+        Heading(
+            f"Prediction: {prediction.n_exposures} exposures of {ny} x {nx} px, {prediction.n_stars} stars "
+            f"({low if low == high else f'{low} to {high}'} on each), degree {prediction.degree}, "
+            f"errors of {scale * prediction.sigma_meas:.4g} {unit}"
+        ),
+        _expected(prediction, unit, scale),
+        *(Sentence(f"found beside, of the size that is stated: {term!r}") for term in prediction.settings.terms),
+        *(() if instrument is None else _by_magnitude(prediction)),
+        Sentence(f"All but what is called absolute is relative: {_relative(prediction)}", wrapped=True),
+        Sentence(
+            f"gauge {solution.gauge.kind}; thumb: s_b = 1/sqrt(n_im), s_sigma = sqrt((1 - 1/n_im)(1 + n_modes/n_star))"
+        ),
+    ]
+
+
+def _expected(prediction, unit, scale):
+    """The table of the criteria."""
     thumb_b, thumb_sigma = prediction.thumb
     aliased = np.any(prediction.folded != 0)  # NaN included
-    unit, scale = unit_of(prediction)
     places = decimals(prediction, scale)
 
     def row(label, noise, aliasing=None, *slopes):
@@ -40,46 +60,40 @@ def describe(prediction):
         if aliased:
             values += [None, None] if aliasing is None else [aliasing, np.hypot(noise, aliasing)]
         cells = ["" if v is None else "not known" if np.isnan(v) else f"{scale * v:.{places}f}" for v in values]
-        return columns(label, cells + [f"{slope:.3f}" for slope in slopes]).rstrip()
-
-    def columns(label, cells):
-        return f"{label:44s}" + "".join(f"{cell:>11s}" for cell in cells)
+        return [label, *cells, *(f"{slope:.3f}" for slope in slopes)]
 
     b, sigma = (prediction.b, prediction.b_alias), (prediction.sigma, prediction.sigma_alias)
-    return "\n".join(
-        [
-            f"Prediction: {prediction.n_exposures} exposures of {ny} x {nx} px, {prediction.n_stars} stars "
-            f"({low if low == high else f'{low} to {high}'} on each), degree {prediction.degree}, "
-            f"errors of {scale * prediction.sigma_meas:.4g} {unit}",
-            columns(
-                f"expected, rms per axis [{unit}]",
-                ["noise", *(["aliasing", "together"] if aliased else []), "/ sigma", "thumb"],
-            ),
-            row("b, star positions, relative", *b, prediction.s_b, thumb_b),
-            row(_absolute(prediction), prediction.b_abs),
-            row("sigma, new positions inside the contour", *sigma, prediction.s_sigma, thumb_sigma),
-            *([row("of this the error of the correction", prediction.sigma_correction)] * bool(instrument)),
-            row("sigma, new positions over the whole field", prediction.sigma_field, finite_rms(prediction.alias_map)),
-            *(row(_MOTIONS[name].format(unit), error) for name, error in prediction.motion_errors.items()),
-            *(f"found beside, of the size that is stated: {term!r}" for term in prediction.settings.terms),
-            *_by_magnitude(prediction),
-            *textwrap.wrap(f"All but what is called absolute is relative: {_relative(prediction)}", 110),
-            f"gauge {solution.gauge.kind}; thumb: s_b = 1/sqrt(n_im), s_sigma = sqrt((1 - 1/n_im)(1 + n_modes/n_star))",
-        ]
+    rows = [
+        row("b, star positions, relative", *b, prediction.s_b, thumb_b),
+        row(_absolute(prediction), prediction.b_abs),
+        row("sigma, new positions inside the contour", *sigma, prediction.s_sigma, thumb_sigma),
+    ]
+    if prediction.settings.instrument is not None:
+        rows.append(row("of this the error of the correction", prediction.sigma_correction))
+    rows.append(
+        row("sigma, new positions over the whole field", prediction.sigma_field, finite_rms(prediction.alias_map))
     )
+    rows += [row(_MOTIONS[name].format(unit), error) for name, error in prediction.motion_errors.items()]
+    heads = ["noise", *(["aliasing", "together"] if aliased else []), "/ sigma", "thumb"]
+    labels, *numbers = zip_longest(*rows, fillvalue="")
+    columns = [Column(f"expected, rms per axis [{unit}]", labels, 44, words=True)]
+    return Grid(columns + [Column(*each, 11) for each in zip(heads, numbers, strict=True)], gap="")
 
 
 def _by_magnitude(prediction):
     """What an instrument measures, and the errors by magnitude."""
-    instrument = prediction.settings.instrument
-    if instrument is None:
-        return
+    instrument, stars = prediction.settings.instrument, prediction.by_magnitude()
     bright, faint = instrument.limits
     from_bright = f"from {bright:.2f} " if np.isfinite(bright) else ""
-    yield f"{repr(instrument)[1:-1]}: stars {from_bright}to {faint:.2f} mag"
-    yield f"{'mag':>8s}{'stars':>8s}{'one exposure [mas]':>22s}{'joint [mas]':>15s}"
-    for mag, n, error, joint in prediction.by_magnitude().iterrows():
-        yield f"{mag:8.1f}{n:8d}{error.value:22.4g}{joint.value:15.4g}"
+    mag, n, error, joint = zip(*stars.iterrows(), strict=True)
+    columns = [
+        Column("mag", [f"{each:.1f}" for each in mag], 8),
+        Column("stars", list(map(str, n)), 8),
+        Column("one exposure [mas]", [f"{each.value:.4g}" for each in error], 22),
+        Column("joint [mas]", [f"{each.value:.4g}" for each in joint], 15),
+    ]
+    yield Sentence(f"{repr(instrument)[1:-1]}: stars {from_bright}to {faint:.2f} mag")
+    yield Grid(columns, gap="")
 
 
 def _absolute(prediction):

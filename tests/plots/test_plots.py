@@ -18,7 +18,7 @@ from legdistort.assessment.pulls import pulls_of
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis
 from legdistort.matching.matches import Matches
-from legdistort.plots import elements, residual_plots, solution_plots, stack_plots
+from legdistort.plots import elements, motion_plots, residual_plots, solution_plots, stack_plots
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.simulation.observations import simulate_matches
@@ -223,6 +223,32 @@ def test_each_step_of_the_correction_leaves_less(solved):
     assert len(without) == 2
 
 
+def stated_scales(panels):
+    """Magnifications that titles state."""
+    return [float(ax.get_title(loc="left").partition(" × ")[2]) for ax in panels]
+
+
+def test_the_last_step_is_magnified_like_the_one_before_it_and_both_are_seen():
+    """Without that, 0.2 and 0.05 px beside 2 px are dots; the scale is the stated one, and that of the bar."""
+    simulated = simulate_matches(n_stars=60, n_exposures=6, sigma=0.03, dither=300, dynamic=0.1, pose_error=0, seed=5)
+    solution = solve(simulated.matches, prior=Prior(simulated.truth.static))
+    panels = residual_plots.plot_steps(solution)
+    first, static, last = stated_scales(panels)
+    assert 3 * first < static == last
+    for ax, scale in zip(panels, (first, static, last), strict=True):
+        lengths = np.hypot(*np.diff(ends(ax), axis=1)[:, 0].T)
+        if ax is not panels[-1]:
+            assert 0.02 * 2048 < np.percentile(lengths, 90) < 0.05 * 2800
+        rms = float(ax.get_title(loc="left").splitlines()[1].split()[0])
+        assert np.sqrt(np.mean(lengths**2) / 2) == pytest.approx(rms * scale, abs=6e-4 * scale)
+        (bar,), (words,) = ax.lines, ax.texts
+        drawn = np.ptp(bar.get_xdata()) * np.ptp(ax.get_xlim())  # pixels of the picture
+        assert drawn == pytest.approx(float(words.get_text().removesuffix(" px")) * scale)
+    two = residual_plots.plot_steps(solution, registered=False)
+    assert [ax.get_title(loc="left") for ax in two] == [ax.get_title(loc="left") for ax in panels[1:]]
+    assert set(stated_scales(residual_plots.plot_steps(solution, scale=70))) == {70}
+
+
 def test_mean_residuals_are_as_large_as_their_errors_say(solved):
     solution, _ = solved
     ax = residual_plots.plot_mean_residuals(solution, scale=1000)
@@ -265,6 +291,29 @@ def test_pulls_are_drawn_by_star_and_by_exposure(solved, against):
     assert dots.get_gid().startswith("marks:s=" if against == "brightness" else "marks:e=")
     with pytest.raises(InputError, match="against must be 'brightness' or 'time', got 'x'"):
         residual_plots.plot_pulls(pulls, against="x")
+
+
+def test_marks_of_what_is_far_off_do_not_shift_those_of_others():
+    """A mark off the picture is none in SVG, or several, and every later one would be named after another star."""
+    rms = np.array([1.0, 40.0, 1.1, 0.9])
+    sums = SimpleNamespace(rms=rms, freedom=np.full(4, 20.0), at=np.array([1.0, 2.0, 4.0, 8.0]), label="flux")
+    ax = residual_plots.plot_pulls(SimpleNamespace(by_star=lambda: sums))
+    (dots,) = [c for c in ax.collections if isinstance(c, PathCollection)]
+    np.testing.assert_array_equal(dots.get_offsets()[:, 1], [1.0, ax.get_ylim()[1], 1.1, 0.9])
+    assert dots.get_gid() == "marks:s=0,1,2,3"
+    ax = stack_plots.plot_mosaic(make_mosaic(300), stars=[[100, 100], [-900, 50], [200, 250], [50, 9e9], [np.nan, 5]])
+    assert ax.collections[0].get_gid() == "marks:s=0,2"
+    np.testing.assert_array_equal(ax.collections[0].get_offsets(), [[100, 100], [200, 250]])
+
+
+def test_points_of_motions_are_marked_with_their_stars():
+    simulated = simulate_matches(n_stars=20, n_exposures=6, degree=1, motion=0.05, dither=100,
+                                 epochs=[2014, 2014.1, 2016, 2016.1, 2018, 2018.1], seed=2)  # fmt: skip
+    solution = solve(simulated.matches, degree=1, motion="proper")
+    for ax in (motion_plots.plot_motions(solution), motion_plots.plot_motion_errors(solution)):
+        (dots,) = [c for c in ax.collections if isinstance(c, PathCollection)]
+        assert dots.get_gid() == "marks:s=" + ",".join(map(str, range(20)))
+        assert len(dots.get_offsets()) == 20
 
 
 def test_mosaic_on_a_slope_shows_its_stars_and_no_empty_bands():

@@ -2,9 +2,11 @@
 
 import shutil
 
+import numpy as np
 import pytest
 from drawn_solutions import make_solution
 
+from legdistort.assessment import baselines
 from legdistort.reporting import page as report
 from legdistort.simulation.observations import simulate_exposures
 
@@ -76,12 +78,88 @@ def test_the_contents_unfold_what_they_lead_to(show, path):
     tab.wait_for_function("Math.abs([...document.querySelectorAll('h2')].at(-1).getBoundingClientRect().top) < 900")
 
 
-def test_labels_of_pictures_are_large_enough_on_a_narrow_screen(show, path):
-    tab = show(path, 400)
-    sizes = tab.evaluate(
-        "[...document.querySelectorAll('figure svg text')].map(e => e.getBoundingClientRect().height).filter(h => h)"
+#: Of every picture the size of the smallest letters on the screen, texts that lie upon each other, and those cut off.
+TEXTS = """() => [...document.querySelectorAll("figure svg")].map(svg => {
+  const texts = [...svg.querySelectorAll("text")].map(e => [e.textContent.trim(), e.getBoundingClientRect(), e]);
+  const shown = texts.filter(([, r]) => r.width && r.height);
+  const size = e => parseFloat(getComputedStyle(e).fontSize) * Math.hypot(e.getScreenCTM().a, e.getScreenCTM().b);
+  const both = (r, q) => [Math.min(r.right, q.right) - Math.max(r.left, q.left),
+                          Math.min(r.bottom, q.bottom) - Math.max(r.top, q.top)];
+  return [Math.min(...shown.map(([, , e]) => size(e))), shown.flatMap(([a, r], i) => shown.slice(i + 1)
+    .filter(([, q]) => both(r, q)[0] > 2 && both(r, q)[1] > 3).map(([b]) => [a, b])),
+    shown.filter(([, r]) => both(r, svg.getBoundingClientRect())[0] < r.width - 2).map(([a]) => a)];
+})"""
+
+
+@pytest.mark.parametrize("width", [1200, 700, 400])
+def test_labels_of_pictures_are_large_enough_and_apart(show, path, width):
+    tab = show(path, width)
+    tab.locator("details.more > summary").click()
+    for size, *faults in tab.evaluate(TEXTS):
+        assert size >= 9
+        assert faults == [[], []]
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    """A page with all pictures that have points, of stars that move, measured on known dates; one star is wild."""
+    import legdistort as ld
+
+    epochs = np.repeat([2014.5, 2016.0, 2018.25], 3)
+    simulated = ld.simulate_matches(
+        n_exposures=9, n_stars=30, degree=1, motion=0.05, dither=300, epochs=epochs, shape=(9000, 12000), seed=3
     )
-    assert min(sizes) > 8
+    table = simulated.matches.table
+    table["flux"] = 10.0 ** (4 + np.unique(table["star"], return_inverse=True)[1] / 60)
+    solution = ld.solve(ld.Matches.from_table(table, shape=(9000, 12000)), degree=1, motion="proper")
+    wild = solution.residuals["star"] == solution.estimate.star_names[4]
+    solution.residuals["dx"][wild] *= 100
+    comparison = {"shift": solution, baselines.METHOD: solution}
+    folder = tmp_path_factory.mktemp("moving")
+    return report.write_report(folder / "report.html", solution, comparison=comparison), solution
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1200, 400])
+def test_large_fields_and_short_logarithmic_axes_have_labels_apart(show, moving, width, scheme):
+    tab = show(moving[0], width, scheme)
+    tab.locator("details.more > summary").click()
+    for size, *faults in tab.evaluate(TEXTS):
+        assert size >= 9
+        assert faults == [[], []]
+
+
+@pytest.mark.slow
+def test_every_point_says_what_it_is_and_exposures_their_dates(show, moving):
+    path, solution = moving
+    tab = show(path, 400)
+    tab.locator("details.more > summary").click()
+    titles = tab.locator("figure svg").evaluate_all("all => all.map(svg => svg.textContent.replace(/\\s+/g, ' '))")
+    of_points = ("Proper motions of", "Errors of proper motions", "stars by brightness", "exposures in time",
+                 "corrected positions, per axis", "rotation [deg]")  # fmt: skip
+    n = len(solution.estimate.star_names)
+    for words in of_points:
+        (k,) = [k for k, title in enumerate(titles) if words in title]
+        marks = tab.locator("figure svg").nth(k).locator(".marks [data-s], .marks [data-e]")
+        found = marks.evaluate_all("all => all.map(e => [e.dataset.s, e.dataset.e])")
+        expected = n if any(s is not None for s, _ in found) else len(solution)
+        assert len({tuple(each) for each in found}) == expected, words
+        marks.first.scroll_into_view_if_needed()
+        marks.nth(2).hover(force=True)
+        tip = tab.locator("#tip")
+        if expected == n:
+            assert (tip.text_content(timeout=2000) or words).startswith("star ")
+        else:
+            assert tip.text_content() == "exposure exp02, 2014-07-02 15:00", words
+        box = tip.bounding_box()
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= 400
+    wild = tab.evaluate("""() => { const names = JSON.parse(document.getElementById("names").textContent).s;
+        const svg = [...document.querySelectorAll("figure svg")].find(e => e.textContent.includes("stars by bright"));
+        const top = each => each.getBoundingClientRect().top;
+        return names[[...svg.querySelectorAll(".marks [data-s]")].sort((a, b) => top(a) - top(b))[0].dataset.s]; }""")
+    assert wild == str(solution.estimate.star_names[4])
 
 
 def test_pointing_at_a_star_marks_it_everywhere(show, path):

@@ -21,7 +21,8 @@ from legdistort.assessment.stack_quality import Quality
 from legdistort.cli import main
 from legdistort.exceptions import LegdistortWarning
 from legdistort.reporting.page import render
-from legdistort.results.check import Check, in_lines, worst
+from legdistort.results.check import Check, in_facts, worst
+from legdistort.runtime.notebook import text_of
 from legdistort.simulation.pupil import PupilPSF
 from legdistort.solving.checks.cures import header_first
 from legdistort.solving.checks.residual_tests import Residuals
@@ -467,7 +468,11 @@ def test_lines_have_the_worst_first():
     ]
     assert worst(checks) == "fail"
     assert checks[2].value is None
-    assert in_lines(checks) == ["checks  1 of 3 pass: a", "fail    c: wrong; stop", "warn    b: odd; look"]
+    assert text_of(in_facts(checks)).splitlines() == [
+        "checks  1 of 3 pass: a",
+        "fail    c: wrong; stop",
+        "warn    b: odd; look",
+    ]
     assert worst([]) == "pass"
 
 

@@ -38,9 +38,10 @@
     if (!keys) return;
     tip.id = "tip";
     tip.textContent = mark(keys);
-    tip.style.left = `${Math.min(event.clientX + 14, window.innerWidth - 180)}px`;
-    tip.style.top = `${Math.max(event.clientY - 30, 4)}px`;
     document.body.append(tip);
+    tip.style.left = "0px"; // as wide as it may be
+    tip.style.left = `${Math.max(Math.min(event.clientX + 14, window.innerWidth - tip.offsetWidth - 4), 0)}px`;
+    tip.style.top = `${Math.max(event.clientY - tip.offsetHeight - 8, 4)}px`;
   });
 
   // Tables
