@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..exceptions import InputError
+from ..exceptions import InputError, MatchError
 from ..geometry import similarity
 from ..inputs.start_poses import estimate_poses
 
@@ -25,7 +25,8 @@ def check_places(matches):
     """Raise `InputError` if more stars cross from detector to detector with two of these exchanged.
 
     By more than chance, 4 standard errors of the difference; with the right places it is always fewer. Of several
-    fields without a common star each is looked at by itself.
+    fields without a common star each is looked at by itself. Nothing shows where exposures have too few stars on the
+    same detectors as others, as those of another roll may.
 
     Parameters
     ----------
@@ -50,9 +51,11 @@ def _check_field(matches):
     focal = {(a, b): camera[b].to_focal_plane(xy[detector == k]) for k, a in enumerate(keys) for b in keys}
     given = _crossing(matches, detector, [focal[key, key] for key in keys])
     for (i, a), (j, b) in combinations(enumerate(keys), 2):
-        if camera[a].shape != camera[b].shape or proved[i, j]:
+        if given is None or camera[a].shape != camera[b].shape or proved[i, j]:
             continue
         other = _crossing(matches, detector, [focal[key, {a: b, b: a}.get(key, key)] for key in keys])
+        if other is None:
+            continue
         exchanged, kept = (sum(n for pair, n in each.items() if {i, j} & {*pair}) for each in (other, given))
         if exchanged - kept > _SURE * np.sqrt(exchanged + kept):
             raise InputError(
@@ -79,13 +82,17 @@ def _proved(matches, detector):
 def _crossing(matches, detector, focal):
     """Numbers of stars on each pair of detectors, by positions in the focal plane, one array for each detector.
 
-    What a detector sees of a star counts as a star of its own, so that poses rest on each detector by itself.
+    What a detector sees of a star counts as a star of its own, so that poses rest on each detector by itself. None
+    where these do not determine the poses.
     """
     f, observations = np.empty((len(detector), 2)), matches.observations
     for k, each in enumerate(focal):
         f[detector == k] = each
     star = np.unique(np.stack([observations.star, detector]), axis=1, return_inverse=True)[1].ravel()
-    poses = estimate_poses(observations.exposure, star, f, names=matches.names)
+    try:
+        poses = estimate_poses(observations.exposure, star, f)
+    except MatchError:
+        return None
     return _agreeing(observations, detector, f, poses)
 
 

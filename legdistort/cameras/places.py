@@ -77,11 +77,13 @@ def relative_errors(camera, covariance):
     """
     each = list(camera.detectors.values())
     known = np.array([d.layout_sigma is None or bool(np.isfinite(d.layout_sigma).all()) for d in each])
+    out = np.full((len(each), 3), np.inf)
+    if not known.any():
+        return out
     rows = np.repeat(known, 6)
     common = shifts_and_turns(camera, 3)[rows]
     left = np.eye(len(common)) - (common @ np.linalg.pinv(common) if np.count_nonzero(known) > 1 else 0.0)
     blocks = (left @ covariance[np.ix_(rows, rows)] @ left.T).reshape(-1, 6, np.count_nonzero(known), 6)
-    out = np.full((len(each), 3), np.inf)
     for i, k in enumerate(np.flatnonzero(known)):
         weights = each[k].place_weights
         out[k] = np.sqrt(np.maximum(np.diag(weights @ blocks[i, :, i] @ weights.T), 0.0))

@@ -20,6 +20,17 @@ _EXACT = 1e-15  # variance, of the largest, that is rounding
 _ROUNDING = 1e-9  # of the largest variance
 
 
+def undetermined_degree(camera):
+    """Highest degree of the maps of the focal plane that were not determined when a camera was found; 0 without any.
+
+    Exposures of a lower degree cannot take over what these have of it.
+    """
+    if camera.common_sigma is None:
+        return 0
+    orders = np.add(*basis.orders(basis.degree_of(camera.common_sigma.shape[1])))
+    return int(orders[np.isinf(camera.common_sigma).any(axis=0)].max(initial=0))
+
+
 def as_widths(value, n, name):
     """Standard deviations given as a number, per mode or per axis and mode, as (2, n); None as None.
 

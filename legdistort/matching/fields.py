@@ -4,11 +4,13 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
+from astropy import units as u
 from astropy.table import vstack
 
 from ..exceptions import AssumptionWarning, InputError, MatchError, some_of, warn
 from ..geometry import similarity
-from ..inputs import exposure_names, start_poses
+from ..inputs import column_contract, exposure_names, start_poses
+from ..inputs.plain_columns import is_text
 
 _BY_NAME = {"shape": "shapes", "poses": "poses", "left_out": "left_out"}
 
@@ -98,7 +100,15 @@ def joined(parts):
 
 
 def stacked(tables):
-    """One table of several, ``{what it is of: table}``, with the columns that all have; warns of others."""
+    """One table of several, ``{what it is of: table}``, with the columns that all have; warns of others.
+
+    A column without a unit, as files have it of a number without one, is in that of the others.
+
+    Raises
+    ------
+    InputError
+        For a column that has numbers in one table and text in another, or units that cannot be converted.
+    """
     lost = {}
     for name in dict.fromkeys(name for table in tables.values() for name in table.colnames):
         lacking = [label for label, table in tables.items() if name not in table.colnames]
@@ -107,4 +117,28 @@ def stacked(tables):
     if lost:
         named = "; ".join(f"{', '.join(names)} (not in {some_of(lacking, 3)})" for lacking, names in lost.items())
         warn(f"columns that not all tables have are left out: {named}; add them there to keep them", AssumptionWarning)
-    return vstack(list(tables.values()), join_type="inner", metadata_conflicts="silent")
+    return vstack(_alike(tables), join_type="inner", metadata_conflicts="silent")
+
+
+def _alike(tables):
+    """The tables, ``{what it is of: table}``, with columns that all have of one kind: numbers in a unit, or none."""
+    parts = {label: table.copy(copy_data=False) for label, table in tables.items()}
+    for name in set.intersection(*(set(part.colnames) for part in parts.values())):
+        texts = {label: is_text(part[name]) for label, part in parts.items()}
+        units = {label: part[name].unit for label, part in parts.items() if isinstance(part[name], u.Quantity)}
+        if len(set(texts.values())) > 1:
+            text, numbers = (next(label for label, each in texts.items() if each is kind) for kind in (True, False))
+            raise InputError(
+                f"column {name!r} has text in {text} and numbers in {numbers}: make them alike, or leave it out of one"
+            )
+        for label, unit in units.items():
+            first, known = next(iter(units.items()))
+            if not unit.is_equivalent(known):
+                raise InputError(
+                    f"column {name!r} is in {known or 'no unit'} in {first} and in {unit or 'no unit'} in {label}: "
+                    "state the same unit, or leave it out of one"
+                )
+        for label in set(parts) - set(units) if units else ():
+            part = parts[label]
+            part[name] = u.Quantity(column_contract.values(part, name), next(iter(units.values())))
+    return list(parts.values())

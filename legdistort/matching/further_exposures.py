@@ -1,6 +1,7 @@
 """Further exposures of the field, or of the camera, of a finished solution: the matches of all of them."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -57,7 +58,8 @@ def with_further(solution, matches):
     _check_new(Observations.of(before), Observations.of(after))
     seen = Observations.of(solution.residuals)
     mean = _mean_distortions(solution, seen, matches)
-    names, joins, poses = _on_its_plane(solution, seen, matches, mean)
+    placed = replace(matches, table=solution.camera.in_focal_plane(after), camera=solution.camera)
+    names, joins, poses = _on_its_plane(solution, seen, placed, mean)
     star = matches.observations.star
     after, names = after[joins[star]], names[star][joins[star]]
     after["star"] = np.array(names.tolist())

@@ -44,8 +44,9 @@ _STATED_SHIFT, _STATED_LAYOUT = 0.1, 10.0
 #: Part of a direction that may be left of it where it counts as one of several.
 _LIES_IN = 0.3
 #: Unknowns of less than this part of the largest of the directions are not judged in units of their own: what
-#: directions have of them is of second order, or rounding.
-_ROUNDED = 1e-3
+#: directions have of them is of second order, gradients of distortions, or rounding. With 0.001 directions that
+#: exposures can take over counted as unknown where static distortions have pixels and a camera tells the layout.
+_ROUNDED = 0.03
 #: Size of modes of a map [pix] of which what is not rounding moves stars by more than a pixel.
 _CLEAR = 10.0
 #: Layouts that agree so well [pix] are the same.

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..cameras import ties
 from ..cameras.exchanged import check_places
-from ..cameras.stated_errors import with_errors_times
+from ..cameras.stated_errors import undetermined_degree, with_errors_times
 from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, SolveError, warn
 from ..geometry import basis
 from ..matching.header_poses import header_map_by, sky_by_layout
@@ -501,10 +501,17 @@ def _estimate(matches, options):
 
 
 def _tell_of_prior(matches, prior, degree):
-    """Say what the default of the degree leaves of a prior of a higher one; warn of an unused distortion of headers."""
+    """Say what the degree leaves of a prior or camera of a higher one; warn of an unused distortion of headers."""
     each = prior.values() if isinstance(prior, dict) else [prior]
     highest = max((p.degree for p in each if isinstance(p, Prior) and p.states_mean), default=0)
-    if isinstance(degree, Unasked) and highest > degree:
+    found = undetermined_degree(matches.camera)
+    if not isinstance(degree, str) and found > degree:
+        log.warning(
+            "exposures are fitted to degree %d%s: camera %s was found with degree %d, and what all exposures share up "
+            "to there was not determined, which exposures of that degree alone can take over: degree=%d (--degree %d)",
+            degree, ", the default" * isinstance(degree, Unasked), matches.camera.name, found, found, found,
+        )  # fmt: skip
+    elif isinstance(degree, Unasked) and highest > degree:
         log.info(
             "exposures are fitted to degree %d, the default: what the prior has beyond, up to degree %d, is held as "
             "given; degree=%d (--degree %d) fits that too", degree, highest, highest, highest,

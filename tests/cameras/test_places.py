@@ -11,6 +11,7 @@ import pytest
 from astropy.table import Table
 
 import legdistort as ld
+from legdistort.cameras.places import relative_errors
 from legdistort.exceptions import ConvergenceWarning, InputError
 from legdistort.solving import camera_fit
 from legdistort.solving.camera_fit import with_declared_size
@@ -130,6 +131,20 @@ def test_without_a_reference_the_line_names_the_map_and_what_a_bend_does(one):
     assert "after one map of degree 3 of all together" in words
     assert "a bend of all together by 1 px rms, which a reference would tell (--reference), shifts single ones" in words
     assert solution.camera.places == {key: each.place for key, each in solution.camera.detectors.items()}
+
+
+def test_places_of_which_nothing_is_known_have_infinite_errors():
+    corners, known = np.array([[0, 0], [540, 0], [540, 540], [0, 540]]), np.full((2, 3), 0.1)
+    for n in (0, 2):
+        detectors = {
+            str(k): ld.Detector((512, 512), layout=np.column_stack([np.eye(2), -corner]),
+                                layout_sigma=known if k < n else np.full((2, 3), np.inf))
+            for k, corner in enumerate(corners)
+        }  # fmt: skip
+        errors = relative_errors(ld.Camera("four", detectors), 0.01 * np.eye(24))
+        assert np.all(np.isinf(errors[n:]))
+        assert np.all(np.isfinite(errors[:n]))
+        assert np.all(errors[:n] <= 0.1)
 
 
 def test_place_errors_are_refused_that_are_none():

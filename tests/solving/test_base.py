@@ -4,6 +4,7 @@ import warnings
 
 import drawn_sets
 import field_sets
+import header_layouts
 import numpy as np
 import pytest
 from astropy.table import Table
@@ -291,3 +292,19 @@ def test_columns_that_some_lack():
     more["colour"] = 1.0
     with pytest.warns(LegdistortWarning, match=r"are left out: colour \(not in the solution\)"):
         ld.solve(ld.Matches.from_table(more, shape=SHAPE), base=ld.solve(old))
+
+
+@pytest.mark.slow
+def test_a_late_exposure_whose_headers_have_the_detectors_wrong_comes_in():
+    """By 25 px, of another roll than most; its stars were taken for their neighbours, and the layout failed."""
+    night = header_layouts.Night(5, off=25.0, n=7, n_stars=200, sigma=0.02, rolls=(0.0, 0.0, 0.0, 0.0, 0.0, 90.0, 90.0))
+    late = night.table["exposure"] == "e6"
+    with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        base = ld.solve(ld.match(night.table[~late], exposures=night.exposures[:-4]), degree=3)
+        new = ld.match(night.table[late], exposures=night.exposures[-4:])
+        found = ld.solve(new, base=base)
+    true = np.asarray(found.residuals["true"])
+    star = np.asarray(found.residuals["star"])
+    assert all(len(set(true[star == each])) == 1 for each in set(star[found.residuals["exposure"] == "e6"]))
+    assert np.count_nonzero(found.residuals["exposure"] == "e6") > 0.8 * np.count_nonzero(late)
+    assert night.pulls(found)[0] < 1.5

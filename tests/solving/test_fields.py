@@ -8,6 +8,7 @@ import field_sets
 import header_layouts
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.table import Table
 from numpy.testing import assert_allclose
 
@@ -296,6 +297,31 @@ def test_columns_that_only_some_fields_have_are_named():
         again = ld.Matches.of_fields(more)
     assert len(told) == 1
     assert again.table.colnames == both.table.colnames
+
+
+def test_columns_with_and_without_a_unit_are_joined():
+    data, truth = field_sets.drawn_fields(9)
+    parts = [drawn_sets.as_matches(only(data, truth, k)[0]) for k in (0, 1)]
+
+    def joined(*columns):
+        fields = {}
+        for label, part, column in zip("ab", parts, columns, strict=True):
+            table = part.table.copy()
+            value, unit = column
+            table["more"] = np.full(len(table), value) if unit is None else np.full(len(table), value) * unit
+            fields[label] = ld.Matches.from_table(table, shape=part.shapes, poses=part.poses)
+        table = ld.Matches.of_fields(fields).table
+        is_first = np.char.startswith(np.asarray(table["exposure"]).astype(str), "a_")
+        return table["more"][is_first][0], table["more"][~is_first][0]
+
+    none = u.dimensionless_unscaled
+    assert joined((1.2, None), (3.4, none)) == (1.2, 3.4)  # as files have it, ASDF and ECSV
+    assert joined((1.2, u.pix), (3, None)) == (1.2 * u.pix, 3 * u.pix)
+    assert joined((1.0, u.arcsec), (1.0, u.deg)) == (1 * u.arcsec, 3600 * u.arcsec)
+    with pytest.raises(InputError, match="column 'more' has text in b and numbers in a: make them alike, or leave it"):
+        joined((1.2, u.pix), ("x", None))
+    with pytest.raises(InputError, match="column 'more' is in pix in a and in arcsec in b: state the same unit"):
+        joined((1.2, u.pix), (1.0, u.arcsec))
 
 
 def test_refused_where_nothing_is_shared():

@@ -1,5 +1,6 @@
 """The next night of a camera that an earlier one taught; nights and their truth are made by numpy alone."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ from astropy.table import Table
 from numpy.testing import assert_allclose
 
 import legdistort as ld
-from legdistort.exceptions import InputError
+from legdistort.exceptions import InputError, LegdistortWarning
 
 SIZE, GAP = 512, 30
 STEP = SIZE + GAP
@@ -142,3 +143,48 @@ def test_errors_of_the_next_night():
         pulls.append(chi2 / dof)
     print(f"squared pull {np.mean(pulls):.2f}")
     assert 0.8 < np.mean(pulls) < 1.3
+
+
+@pytest.mark.slow
+def test_static_distortions_sought_anew_leave_nothing_unknown():
+    """Of 1 px; one to three directions that exposures take over counted as unknown, and absolute errors were NaN."""
+    pulls = []
+    for seed in range(1, 7):
+        optics = Optics(seed)
+        optics.bends *= 5
+        first = {"degree": 4, "layout": "fit", "static": "fit"}
+        table, poses, _ = optics.night(100 * seed + 1, 0.02, exposures=8)
+        known = ld.solve(ld.Matches.from_table(table, camera=camera(), poses=poses), **first).camera
+        table, poses, sky = optics.night(100 * seed + 2, 0.02, exposures=8)
+        found = ld.solve(ld.Matches.from_table(table, camera=known, poses=poses), degree=4, static="fit")
+        assert found.estimate.uncertainty.camera.unknown.shape[-1] == 0
+        assert "do not determine how" not in " ".join(check.sentence for check in found.checks)
+        chi2, dof = squared_pull(found, sky)
+        pulls.append(chi2 / dof)
+    print(f"squared pull {np.mean(pulls):.2f}")
+    assert 0.7 < np.mean(pulls) < 1.4
+
+
+@pytest.mark.slow
+def test_the_degree_of_the_camera_is_the_first_cure_where_that_of_the_exposures_is_lower(caplog):
+    optics = Optics(5)
+    optics.bends *= 5
+    table, poses, _ = optics.night(501, 0.01, exposures=6)
+    first = {"degree": 3, "layout": "fit", "static": "fit"}
+    known = ld.solve(ld.Matches.from_table(table, camera=camera(), poses=poses), **first).camera
+    table, poses, _ = optics.night(502, 0.003, exposures=6)
+    matches = ld.Matches.from_table(table, camera=known, poses=poses)
+    words = "camera FOUR was found with degree 3, and what all exposures share up to there was not determined"
+    with caplog.at_level("WARNING"), warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        low = ld.solve(matches, degree=2)
+    assert f"exposures are fitted to degree 2: {words}" in caplog.text
+    wrong = [check for check in low.checks if check.state in ("warn", "fail")]
+    (cure,) = [check for check in wrong if check.cure == "--degree 3"]
+    assert "exposures of degree 2 cannot take over what the camera, found with degree 3" in cure.sentence
+    others = [check.cure for check in wrong if check is not cure]
+    assert others
+    assert all(each.startswith(f"see {cure.name} first, which may be the cause") for each in others)
+    assert all(each.count(" first, which may") == 1 for each in others)
+    caplog.clear()
+    enough = ld.solve(matches)
+    assert "was found with degree" not in caplog.text + " ".join(check.sentence for check in enough.checks)

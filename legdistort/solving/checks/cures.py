@@ -4,12 +4,14 @@ What would be left of the residuals with an effect fitted, with other errors or 
 same checks; the first cure that brings a check to pass is its cure, with the figure that it would reach.
 """
 
+import re
 from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import brentq
 
 from ...cameras.star_scales import flux_levels
+from ...cameras.stated_errors import undetermined_degree
 from ...geometry import basis
 from ...results.check import FALSE_ALARM, STATES, WRONG
 from ...results.diagnostics import ErrorLaw, filled
@@ -45,6 +47,8 @@ _BY_FIELDS = "chi2", "brightness", "degree"
 #: Those that a static distortion of too low a degree fails, and what they say of it.
 _BY_DEGREE = "degree", "place"
 _STATIC = "; what is missing is alike in all exposures of a detector (static)"
+#: Those that too low a degree for the camera fails, the one that has the words first.
+_OF_DEGREE = "degree", "chi2", "reference", "rejection", "exposures", "camera"
 #: What a static distortion that is hardly determined, or none, may be behind.
 _OF_DISTORTION = {"chi2", "brightness", "place", "degree", "reference", "overlaps", "extrapolation"}
 
@@ -331,3 +335,20 @@ def header_first(checks):
         return replace(check, cure=f"--prior header (see header distortion and {loose[0]}); else {check.cure}")
 
     return tuple(map(with_header, checks))
+
+
+def camera_first(checks, solution):
+    """Checks that do not pass, the degree at which the camera was found first, if that of the exposures is lower."""
+    degree, each = undetermined_degree(solution.camera), {check.name: check for check in checks}
+    first = next((name for name in _OF_DEGREE if name in each and each[name].state in WRONG), None)
+    if degree <= solution.degree or first is None:
+        return checks
+    why = f"; exposures of degree {solution.degree} cannot take over what the camera, found with degree {degree}, has "
+    why += "of a map that all exposures share, which was not determined"
+    each[first] = replace(each[first], sentence=each[first].sentence + why, cure=f"--degree {degree}")
+    for name, check in each.items():
+        if name != first and check.state in WRONG:
+            rest = re.sub(r"^see [\w ]+ first, which may be the cause(; else )?", "", check.cure)
+            cure = f"see {first} first, which may be the cause" + (rest and f"; else {rest}")
+            each[name] = replace(check, cure=cure)
+    return tuple(each.values())

@@ -19,7 +19,7 @@ from ...results.errors.header_pointing import CURE as POINTING_CURE
 from ...results.gauge import warning_of
 from ..terms.observed import Observed
 from .camera_check import camera_check, contradicted_layout, undetermined
-from .cures import header_first, with_cost, with_cures
+from .cures import camera_first, header_first, with_cost, with_cures
 from .dynamic_check import EVIDENCE, dynamic_check, mirrored_check, nights_check, significance
 from .extrapolated_maps import extrapolation_check
 from .limits import MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
@@ -118,7 +118,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     if contradicted is not None:  # of residuals that it makes nothing else is told
         wrong = {check.name for check in made if check.state in WRONG} - {"camera"}
         return tuple(replace(c, cure="see camera first, which is the cause") if c.name in wrong else c for c in made)
-    return header_first(_causes_first(made, explained))
+    return header_first(camera_first(_causes_first(made, explained), solution))
 
 
 def _by_residuals(solution, residuals, *, times):
