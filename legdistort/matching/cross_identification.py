@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..exceptions import InputError
+from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import similarity, star_hull
 from ..geometry.tangent_plane import TangentPlane, angles, directions
 from ..inputs.references.catalogue import Reference
@@ -26,6 +26,10 @@ _MARGIN = 0.5
 _CHANCE = 0.03
 #: How far, as a part of it, the pixel scale may be from the one that is given.
 _SCALE = 0.2
+#: Sky of headers that stars of a reference bear out: to so much in the logarithm of its scale, and in degrees.
+_ALIKE = 0.03, 3.0
+#: Stars from which on lists have a pattern.
+_FEWEST = 5
 _ARCSEC = 1 / 3600
 
 
@@ -76,7 +80,9 @@ def identify(reference, names, positions, *, flux=None, sky=None, pixel_scale=No
     """Find the stars that a solution and a reference have in common.
 
     By name if the reference names them; else on the plane, where chance must not explain what agrees; else, with
-    celestial positions and no sky known, by their pattern, in any orientation.
+    celestial positions where no sky is known, or none of them lies where it has them, by their pattern, in any
+    orientation. Of a sky that is turned, mirrored, of another scale or elsewhere a warning is given, and it is that of
+    the reference then.
 
     Parameters
     ----------
@@ -106,8 +112,8 @@ def identify(reference, names, positions, *, flux=None, sky=None, pixel_scale=No
     mine, theirs, sky = _pairs(reference, names[rows], positions[rows], flux, sky, pixel_scale)
     rows, others = rows[mine], reference.subset(np.setdiff1d(np.arange(len(reference)), theirs))
     reference = reference.subset(theirs)
-    if reference.xy is None and sky is None:
-        sky = _tangent_plane(reference, positions[rows])
+    if reference.xy is None:
+        sky = _checked_sky(reference, positions[rows], sky)
     found = reference.on_plane(sky)
     _check_agreement(reference.label, positions[rows], found.xy, np.ptp(positions[solved], axis=0).max())
     missing = _missing(others.on_plane(sky), found.xy, positions[rows], positions[solved])
@@ -123,12 +129,26 @@ def _pairs(reference, names, positions, flux, sky, pixel_scale):
         return *_by_pattern(reference, positions, flux, pixel_scale), sky
     try:
         return *_on_plane(reference, reference.on_plane(sky).xy, positions, flux), sky
-    except InputError:  # the plane of a solution of its own
-        is_own = reference.maps is not None and reference.xy is not None
-        found = _turned(reference, positions, flux) if is_own else None
+    except InputError as error:
+        if reference.xy is None:
+            return *_despite_sky(reference, positions, flux, sky, pixel_scale, error), sky
+        # the plane of a solution of its own
+        found = _turned(reference, positions, flux) if reference.maps is not None else None
         if found is None:
-            raise
+            raise InputError(f"{error}: another field, or the wrong columns?") from None
         return *found, None
+
+
+def _despite_sky(reference, positions, flux, sky, pixel_scale, error):
+    """Rows by pattern alone of stars that lie nowhere near where the sky has them; else the error."""
+    few = min(len(reference), len(positions)) < _FEWEST
+    found = None if few else _same_pattern(reference, positions, flux, pixel_scale, sky.pixel_scale)
+    if found is None:
+        searched = "" if few else ", nor is their pattern found in it, whatever the headers state"
+        raise InputError(
+            f"{error}{searched}: another field, the wrong columns, or a wrong sky in the headers?"
+        ) from None
+    return found
 
 
 def same_stars(one, two, label):
@@ -203,7 +223,6 @@ def _on_plane(reference, plane, positions, flux):
     raise InputError(
         f"none of the {len(plane)} stars of {reference.label} lies where a star of the exposures is"
         + (f"; the nearest two are {distance:.0f} px apart" if distance < 1e8 else "")
-        + ": another field, the wrong columns, or a wrong sky in the headers?"
     )
 
 
@@ -217,7 +236,7 @@ def _registered(source, target, source_flux, target_flux, near, *, guess):
 
     The shorter list is laid on the longer one: of a part of the longer most stars may have none in the other.
     """
-    if min(len(source), len(target)) < 5:
+    if min(len(source), len(target)) < _FEWEST:
         return None
     fluxes = (None, None) if source_flux is None or target_flux is None else (source_flux, target_flux[near])
     lists = []
@@ -242,20 +261,15 @@ def _neighbours(positions, plane, span):
 
 def _by_pattern(reference, positions, flux, pixel_scale):
     """Rows of the stars and of the reference, by pattern alone, on a plane around the middle of the reference."""
-    if len(reference) < 5 or len(positions) < 5:
+    if len(reference) < _FEWEST or len(positions) < _FEWEST:
         raise InputError(
             f"the exposures have no WCS, and {len(reference)} stars of {reference.label} and {len(positions)} of the "
             "exposures are too few to find one by their pattern: name them in a column star, or take more"
         )
-    xy = reference.on_plane(_middle(reference.sky, _ARCSEC)).xy
-    scales = scale_candidates(positions, xy)
-    if pixel_scale is not None:
-        scales = [s for s in scales if abs(np.log(s / pixel_scale)) < _SCALE] + [pixel_scale]
-    for scale in scales:
-        found = _registered(positions, xy / scale, flux, reference.flux, slice(None), guess=False)
-        if found is not None:
-            log.info("the stars were found in %s by their pattern: %d pairs", reference.label, len(found[0]))
-            return found
+    found = _same_pattern(reference, positions, flux, pixel_scale)
+    if found is not None:
+        log.info("the stars were found in %s by their pattern: %d pairs", reference.label, len(found[0]))
+        return found
     raise InputError(
         f"the exposures have no WCS, and the pattern of their {len(positions)} stars is not that of the "
         f"{len(reference)} of {reference.label}"
@@ -263,6 +277,24 @@ def _by_pattern(reference, positions, flux, pixel_scale):
         + ": another field, too small a part of it, or another pixel scale (pixel_scale=, --pixel-scale)? The "
         "brightest stars of it alone, as many as the exposures have, or a column star that names them help as well"
     )
+
+
+def _same_pattern(reference, positions, flux, pixel_scale, stated=None):
+    """Rows of the stars and of the reference that are in one pattern, at a scale that is given, or `stated`; or None.
+
+    Both in arcsec a pixel; another one than the stated one is tried too, and none that is far from the given one.
+    """
+    xy = reference.on_plane(_middle(reference.sky, _ARCSEC)).xy
+    scales = scale_candidates(positions, xy)
+    if pixel_scale is not None:
+        scales = [s for s in scales if abs(np.log(s / pixel_scale)) < _SCALE] + [pixel_scale]
+    elif stated is not None:
+        scales = [stated, *scales]
+    for scale in scales:
+        found = _registered(positions, xy / scale, flux, reference.flux, slice(None), guess=False)
+        if found is not None:
+            return found
+    return None
 
 
 def _middle(sky, scale):
@@ -280,6 +312,29 @@ def _tangent_plane(reference, positions):
         )
     plane = _middle(reference.sky, 1.0)
     return TangentPlane(plane.lon, plane.lat, similarity.robust_similarity(positions, reference.on_plane(plane).xy))
+
+
+def _checked_sky(reference, positions, sky):
+    """The sky that identified stars (n, 2) bear out, or else theirs, with a warning where they contradict it."""
+    if sky is not None and len(positions) < 3:
+        return sky
+    by_stars = _tangent_plane(reference, positions)
+    if sky is None:
+        return by_stars
+    middle, here = positions.mean(axis=0), reference.on_plane(sky).xy
+    off = similarity.describe(similarity.robust_similarity(positions, here))
+    shift = np.hypot(*(np.median(here, axis=0) - np.median(positions, axis=0)))
+    near = shift < _MARGIN * np.ptp(positions, axis=0).max()
+    if near and abs(np.log(off["scale"])) < _ALIKE[0] and abs(off["rotation"]) < _ALIKE[1] and off["parity"] > 0:
+        return sky
+    angle = f"turned by {off['rotation']:.3g} deg" if off["parity"] > 0 else "mirrored"
+    warn(
+        f"the header WCSs contradict {reference.label}: by {len(positions)} of its stars the field is "
+        f"{by_stars.to_sky(middle).separation(sky.to_sky(middle)).arcsec:.3g} arcsec from where they have it, {angle}, "
+        f"at {by_stars.pixel_scale:.4g} arcsec a pixel, not {sky.pixel_scale:.4g}; the sky is that of these stars",
+        AssumptionWarning,
+    )
+    return by_stars
 
 
 def _missing(others, xy, places, positions):

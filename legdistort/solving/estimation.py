@@ -282,7 +282,7 @@ def solve(
         diagnostics = _diagnostics(given, fit, prior, scale, pointing=given.pointing, terms=found(scale), **chosen)
         fit = _placed(fit, sought, given, whole) if tie is None else tie(fit, scale=scale)
     epoch = fit.matches.epoch if epoch is None else epoch
-    sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
+    sky = _source_of_sky(given, fit, tie)
     found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue), epoch=epoch)
     solution = _with_camera(_solution(fit, scale, _settings(asked, options, form), found, form), given)
     if words := warning_of(solution):
@@ -292,6 +292,13 @@ def solve(
     if sought is not None:
         kept_out = solution.camera.in_focal_plane(matches.camera.on_detectors(kept_out))
     return replace(solution, diagnostics=replace(found, validation=validation(solution, kept_out, validate)))
+
+
+def _source_of_sky(given, fit, tie):
+    """Whether the sky is that of the exposures, which a reference may bear out, or that of the reference; or None."""
+    if given.sky is not None and (tie is None or fit.matches.sky is given.sky):
+        return "exposures"
+    return None if fit.matches.sky is None else "reference"
 
 
 def _with_camera(solution, given):

@@ -32,8 +32,13 @@ _ODD = (
     "which legdistort attach writes"
 )
 _UNDECIDED = (
-    "the positions of the stars do not count on these headers, the sky does, by so much: tie it to a catalogue "
-    "(--reference); legdistort attach then writes better headers"
+    "the positions of the stars do not count on these headers, the sky does: tie it to a catalogue (--reference); "
+    "legdistort attach then writes better headers"
+)
+#: The same where the sky is that of a reference.
+_UNDECIDED_TIED = (
+    "neither the positions of the stars nor the sky count on these headers: nothing is to be done for them; other "
+    "programs need better ones, which legdistort attach writes"
 )
 _NEARER = (
     "a layout that is nearer, by better headers or a camera file (--camera), if these dithers are larger than the "
@@ -120,7 +125,8 @@ def _headers_by_group(solution):
         headers = compare_headers(exact) if len(group) > 1 else None
         words += [headers.sentence("the stars have them")] if headers is not None and headers.scatter > LEAST else []
     words = [each for each in words if each]
-    return Check("camera", "warn", None, None, "; ".join(words), _UNDECIDED) if words else None
+    cure = _UNDECIDED if solution.gauge.tie is None else _UNDECIDED_TIED
+    return Check("camera", "warn", None, None, "; ".join(words), cure) if words else None
 
 
 def _headers(solution, found):
@@ -131,7 +137,8 @@ def _headers(solution, found):
     there = "the stars put it" if found else f"camera {camera.name} has it, which was given"
     if headers.is_undecided:
         there = "the stars have them" if found else f"camera {camera.name} has them, which was given"
-        return Check("camera", "warn", headers.scatter, FAR, headers.sentence(there), _UNDECIDED)
+        cure = _UNDECIDED if solution.gauge.tie is None else _UNDECIDED_TIED
+        return Check("camera", "warn", headers.scatter, FAR, headers.sentence(there), cure)
     if words := headers.sentence(there):
         cure = _ODD if found else f"--layout fit tells which of the two is right; {_ODD}"
         return Check("camera", "warn", headers.far, LEAST, words, cure)
