@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import time
-import uuid
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from .assessment import baselines, run_checks, stack_quality
@@ -30,9 +27,10 @@ from .inputs.references.gaia import is_gaia
 from .matching.matcher import match
 from .matching.matches import alone
 from .matching.options import MatchOptions, check_enough
-from .measurement.earlier import DETECTIONS, PSFS, EarlierRun, folder_of_measured, write_detections
+from .measurement.earlier import DETECTIONS, EarlierRun, write_detections
 from .measurement.options import MeasureOptions
 from .measurement.positions import measure_with_psfs, write_psfs
+from .measurement.unfinished import Unfinished
 from .priors.prior import HEADER, HeaderPrior
 from .reporting.page import write_report
 from .reporting.summary import rounded, summarise
@@ -151,7 +149,7 @@ def run(
         See `legdistort.read_exposures`. By default the frames of an `earlier` run.
     out : str or path
         Folder for the results; made if it does not exist. Nothing is left there if the run fails; what it has measured
-        of files is then in the folder ``OUT.measured`` beside it, for `earlier`, and the error says so.
+        of files, be it killed, is then in the folder ``OUT.measured`` beside it, for `earlier`, and the error says so.
     earlier : str or path, optional
         Folder of an earlier run, whose measured positions are taken instead of measuring anew. All options but those of
         reading and measuring may differ, and are those of this call (the command ``run --from`` repeats those of the
@@ -246,15 +244,15 @@ def run(
     reading = {"ext": ext, "dq_good": dq_good, "weight_maps": weight_maps, "camera": camera}
     paths, reading, before = _where_to_begin(paths, earlier, measuring, **reading)
     how = {"measuring": before.measuring if before else measuring, **reading}
-    share, timings, measured = {"workers": workers, "progress": progress}, _of_start(), {}
-    with _keeping(measured, out := Path(out)), outputs.replacing_folder(out, results=RESULTS, keep=keep) as target:
+    share, timings, at_work = {"workers": workers, "progress": progress}, _of_start(), _unfinished(out := Path(out))
+    with at_work, outputs.replacing_folder(out, results=RESULTS, keep=keep) as target:
         check_results(out, overwrite)  # again: nobody else writes there any more
         with timed(timings, "read"):
             exposures, bad = _opened(paths, before, without, min_exposures, stop_at_bad, progress, reference, **reading)
             solving = _known_of(exposures, solving, prior, reading["camera"])
             stated_numbers({whole_name(e): e.header for e in exposures}, matching.keywords)  # refuses what none states
         with timed(timings, "measure"):
-            detections, psfs = _detected(exposures, before, how, share, measured)
+            detections, psfs = _detected(exposures, before, how, share, at_work)
         with timed(timings, "match"):
             matches = match(detections, exposures=exposures, camera=reading["camera"], **vars(matching))
             matches = replace(matches, left_out=bad | matches.left_out)
@@ -324,8 +322,8 @@ def _written_summary(target, summary, timings, report):
         report()
     begun, asked, _ = _command.get()
     summary = summary | {"timings": rounded(timings)} | ({} if begun is None else {"options": asked})
-    summary |= listed_files(target)
-    write_summary(target / "summary.json", summary)
+    summary |= outputs.listed_files(target)
+    outputs.write_summary(target / "summary.json", summary)
     return summary
 
 
@@ -341,6 +339,12 @@ def called_by(begun, options, again):
         yield
     finally:
         _command.reset(token)
+
+
+def _unfinished(out):
+    """What keeps what a run measures until its results are there."""
+    begun, asked, again = _command.get()
+    return Unfinished(out, {} if begun is None else {"options": asked}, again)
 
 
 def _of_start():
@@ -492,20 +496,6 @@ def linked_files(made):
     return [first + "/" * len(more) for first, *more in parts]
 
 
-def listed_files(target):
-    """The entries of the summary on the files beside it: an identifier of the run, and ``{name: SHA-256}``.
-
-    A file with another checksum shows a program that results of two runs are mixed there.
-    """
-    return {"run": uuid.uuid4().hex, "files": outputs.contents(target)}
-
-
-def write_summary(path, summary):
-    """Write figures as JSON, in the place of those that are there."""
-    with outputs.replacing(path, overwrite=True) as file:
-        file.write(f"{json.dumps(summary, indent=1)}\n".encode())
-
-
 def _compared(wanted, matches, solution, solving, mosaic, kept, coadding, timings):
     """Other corrections, and the stacks that they make where that of the run could be judged; None where not wanted."""
     if not wanted:
@@ -565,60 +555,24 @@ def _check_exposures(exposures, min_exposures, bad, tied):
         check_enough(n_frames, min_exposures, "usable exposures" if bad else "exposures")
 
 
-def _detected(exposures, before, how, share, measured):
+def _detected(exposures, before, how, share, at_work):
     """Detections and PSFs, from an earlier run or measured now; `InputError` if there is no star at all.
 
-    What is measured now is put into the dict `measured`, arguments of `_keep`.
+    What is measured now is put into the `Unfinished`.
     """
-    detections, psfs = before.of(exposures) if before else measure_with_psfs(exposures, how["measuring"], **share)
+    if before and before.is_whole:
+        detections, psfs = before.of(exposures)
+    else:
+        at_work.begin(exposures, before, how)
+        detections, psfs = measure_with_psfs(exposures, how["measuring"], kept=at_work, **share)
+        at_work.complete(detections, psfs)
     if len(detections) == 0:
         raise InputError(
             f"no star was detected in any of the {len(exposures)} frames: look at one of them; if there are stars, "
             "lower the limit of detection (default 5), measuring={'threshold': 3} (--threshold 3), or give the width "
             "of the stars in pixels, measuring={'fwhm': ...} (--fwhm PIXELS)"
         )
-    measured |= {} if before else {"table": detections, "psfs": psfs, "exposures": exposures, "how": how}
     return detections, psfs
-
-
-@contextmanager
-def _keeping(measured, out):
-    """A block whose errors do not lose what it has measured, and say how to go on from there.
-
-    Parameters
-    ----------
-    measured : dict
-        Filled in the block once all is measured; arguments of `_keep` (see `_detected`).
-    out : Path
-        Folder of the results that are not made.
-    """
-    try:
-        yield
-    except BaseException as error:
-        told = _keep(out, **measured) if measured else None
-        if told and isinstance(error, LegdistortError) and len(error.args) == 1:
-            error.args = (f"{error}; {told}",)
-        elif told:
-            log.warning("%s", told)
-        raise
-
-
-def _keep(out, table, psfs, exposures, how):
-    """Leave what was measured beside the folder of results, whole or not at all; how to go on from it, or None."""
-    if any(exposure.path is None for exposure in exposures):  # which nothing could go on from
-        return None
-    begun, asked, again = _command.get()
-    place, options = folder_of_measured(out), {} if begun is None else {"options": asked}
-    try:
-        with outputs.replacing_folder(place, results=(DETECTIONS, f"{PSFS}/*.fits", provenance.SUMMARY)) as target:
-            write_psfs(psfs, target / PSFS)
-            write_detections(target / DETECTIONS, table, exposures, place, **how)
-            write_summary(target / provenance.SUMMARY, options | listed_files(target))
-    except (LegdistortError, OSError) as error:
-        log.warning("what was measured could not be kept: %s", error)
-        return None
-    call = f"{again} --from {quote(str(place))}" if again else f"run(earlier={str(place)!r}, out={str(out)!r}, ...)"
-    return f"what was measured is kept in {place}, to go on from without measuring: {call}"
 
 
 @contextmanager

@@ -197,10 +197,8 @@ def do_solve(a):
         SOLVED,
         check_results,
         linked_files,
-        listed_files,
         timed,
         write_results,
-        write_summary,
     )
     from ..reporting.page import write_report
     from ..reporting.summary import summarise
@@ -221,7 +219,7 @@ def do_solve(a):
             write_results(solution, target, progress=wants_progress(a))
         files = linked_files((*SOLVED, "summary.json"))
         write_report(target / "report.html", solution, summary=summary, files=files)
-        write_summary(target / "summary.json", summary := summary | listed_files(target))
+        outputs.write_summary(target / "summary.json", summary := summary | outputs.listed_files(target))
     _report(a, solution, summary)
     return _status(a, summary)
 

@@ -73,6 +73,45 @@ class FrameStars(NamedTuple):
     factor_error: float = 0.0
 
 
+class MeasuredExposure(NamedTuple):
+    """Detections of one exposure.
+
+    Attributes
+    ----------
+    table : `~astropy.table.QTable`
+        As from `measure`.
+    photon : float or None
+        Variance per unit of star light if it had to be estimated, for want of a gain.
+    psf : `~legdistort.measurement.effective.model.EffectivePSF` or None
+        None if Moffat profiles were fitted.
+    verdict : `~legdistort.measurement.effective.frame_psf.Verdict`
+    noise_ratio : float or None
+        Of the noise seen to that which the gain implies, where that is doubtful (`camera_gain.contradiction`).
+    shape : ndarray, shape (4,), or None
+        Of its stars.
+    hidden : bool
+        Whether its mask hides most bright stars.
+    factor_error : float
+        Relative error common to all fluxes, see `legdistort.measurement.effective.total_light`.
+    """
+
+    table: QTable
+    photon: float | None
+    psf: object
+    verdict: object
+    noise_ratio: float | None = None
+    shape: np.ndarray | None = None
+    hidden: bool = False
+    factor_error: float = 0.0
+
+    def in_unit(self, unit):
+        """The same in a unit of light that is so many times larger."""
+        table = self.table.copy()
+        for name in ("flux", "flux_err"):
+            table[name] = table[name] / unit
+        return self._replace(table=table, photon=self.photon and self.photon / unit)
+
+
 def empty_table():
     """The table of a frame in which nothing is found."""
     columns = {name: np.zeros(0) * (u.pix if name in _PIXELS else 1) for name in _COLUMNS}

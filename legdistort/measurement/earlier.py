@@ -1,9 +1,9 @@
 """Positions that an earlier run measured, so that another one goes on from there."""
 
+import json
 import os
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,8 @@ from .options import MeasureOptions
 
 #: Files of a run that have what it measured.
 DETECTIONS, PSFS = "detections.ecsv", "psf"
+#: What a summary calls how measuring began, as long as not all is measured.
+BEGUN = "begun"
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +37,14 @@ class EarlierRun:
         Detections of all its exposures, as `legdistort.measure` gives them.
     psfs : dict of str to EffectivePSF
         Of the exposures that have one.
+    is_whole : bool
+        Whether all was measured. Else the table is empty, and has in its header how it was begun.
     """
 
     folder: Path
     table: Table
     psfs: dict = field(default_factory=dict)
+    is_whole: bool = True
 
     @classmethod
     def read(cls, folder):
@@ -57,6 +62,8 @@ class EarlierRun:
     @classmethod
     def _read(cls, folder):
         """The object, and the names of the files that it was read from."""
+        if not (folder / DETECTIONS).is_file() and (begun := begun_in(folder)) is not None:
+            return cls(folder, Table(meta=begun), is_whole=False), [provenance.SUMMARY]
         if not (folder / DETECTIONS).is_file():
             lost = way_back(folder / DETECTIONS) or ": give the folder of the results of a run"
             raise InputError(f"{folder} has no {DETECTIONS}{lost}")
@@ -118,8 +125,19 @@ class EarlierRun:
         Raises
         ------
         InputError
-            Naming a frame that was not measured, that has changed, or that is in no file; or the detectors are called
-            otherwise.
+            As `check` does.
+        """
+        self.check(exposures)
+        names = [whole_name(exposure) for exposure in exposures]
+        table = self.table[np.isin(self.table["exposure"], names)]
+        table.meta = {}
+        return table, {exposure.name: self.psfs[exposure.name] for exposure in exposures if exposure.name in self.psfs}
+
+    def check(self, exposures):
+        """Raise `InputError` unless exposures, as `named` calls them, are some of those that were measured.
+
+        Naming a frame that was not measured, that has changed, or that is in no file; or the detectors are called
+        otherwise.
         """
         without = [exposure.name for exposure in exposures if not isinstance(exposure, ExposureFile)]
         if without:
@@ -140,35 +158,15 @@ class EarlierRun:
                 f"{self.folder} has no positions of {strange[0]}: the camera does not name the detectors as they were "
                 "measured; leave it out, or measure the frames again with it"
             )
-        names = [whole_name(exposure) for exposure in exposures]
-        table = self.table[np.isin(self.table["exposure"], names)]
-        table.meta = {}
-        return table, {exposure.name: self.psfs[exposure.name] for exposure in exposures if exposure.name in self.psfs}
 
 
-def folder_of_measured(out):
-    """Where a run that fails keeps what it has measured: beside its folder, under a name that nothing else has.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the results that it could not make.
-
-    Returns
-    -------
-    Path
-        ``OUT.measured``, or with a number behind it. It may have what another such run has left, which gives way.
-    """
-    whole = out if out.name not in ("", "..") else Path(os.path.abspath(out))
-    places = (whole.with_name(f"{whole.name}.measured{f'-{n}' if n > 1 else ''}") for n in count(1))
-    return next(place for place in places if not os.path.lexists(place) or _is_unfinished(place))
-
-
-def _is_unfinished(place):
-    """Whether a folder has nothing but what a run measured that failed."""
-    files = provenance.files_of_run(place)
-    own = {provenance.SUMMARY, DETECTIONS, PSFS}
-    return files is not None and DETECTIONS in files and {path.name for path in place.iterdir()} <= own
+def begun_in(folder):
+    """How measuring began that a folder has some images of, the arguments of `described`; None if it is no such one."""
+    try:
+        begun = json.loads((Path(folder) / provenance.SUMMARY).read_text(encoding="utf-8"))[BEGUN]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return begun if isinstance(begun, dict) and isinstance(begun.get("frames"), list) else None
 
 
 def _plain_options(measuring):
@@ -176,6 +174,11 @@ def _plain_options(measuring):
     usual = vars(MeasureOptions())
     kept = {name: value for name, value in vars(measuring).items() if isinstance(value, str | int | float)}
     return {name: value for name, value in kept.items() if value != usual[name]}
+
+
+def is_described(exposures, measuring):
+    """Whether what `described` states is all that measuring these exposures takes: not of PSFs or frames in memory."""
+    return all(each.path is not None for each in exposures) and isinstance(measuring.psf, str)
 
 
 def measured_frames(tables):
@@ -238,8 +241,15 @@ def write_detections(
         Replace a file that exists.
     """
     table = detections.copy()
+    how = {"ext": ext, "dq_good": dq_good, "weight_maps": weight_maps, "camera": camera}
+    table.meta |= described(exposures, out, measuring=measuring, **how)
+    write_table(table, path, overwrite=overwrite)
+
+
+def described(exposures, out, *, measuring, ext=None, dq_good=None, weight_maps=None, camera=None):
+    """What goes beside measured positions so that a run goes on from them; arguments as of `write_detections`."""
     files = list(dict.fromkeys(exposure.path for exposure in exposures if exposure.path is not None))
-    table.meta |= {
+    return {
         "inputs": file_checksums(exposures),
         "frames": [os.path.relpath(file, out) for file in files],
         "shapes": {exposure.name: list(exposure.shape) for exposure in exposures},
@@ -249,4 +259,3 @@ def write_detections(
         "camera": camera and camera.to_meta(),
         "measuring": _plain_options(measuring),
     }
-    write_table(table, path, overwrite=overwrite)

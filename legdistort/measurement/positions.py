@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.table import QTable, vstack
@@ -21,7 +21,7 @@ from ..runtime.parallel import map_items
 from ..runtime.progress import EACH_IMAGE
 from . import across_frames, camera_gain
 from .crowding import SAME, SHAPELY, crowding, is_crowded, is_deformed
-from .detections import FrameStars, Stars, distinct, empty_table, table_of, with_defects
+from .detections import FrameStars, MeasuredExposure, Stars, distinct, empty_table, table_of, with_defects
 from .effective import frame_psf
 from .effective.building import STARS_NEEDED
 from .effective.model import EffectivePSF
@@ -259,25 +259,32 @@ def write_psfs(psfs, folder):
         psf.write(folder / f"{name}.fits")
 
 
-def measure_with_psfs(exposures, options, *, workers=None, progress=False):
+def measure_with_psfs(exposures, options, *, kept=None, workers=None, progress=False):
     """What `measure` returns, and the PSFs of the exposures that have one, by name.
 
     Parameters
     ----------
     exposures : sequence of Exposure
     options : `~legdistort.measurement.options.MeasureOptions`
+    kept : `~legdistort.measurement.unfinished.Unfinished`, optional
+        Has exposures that are measured already, and takes the others as soon as these are.
     workers : int, optional
     progress : bool
     """
     share = partial(map_items, workers=workers, progress=progress)
-    use_compiled_loops(sum(np.prod(exposure.shape) for exposure in exposures))
-    gains = {} if options.gain else _camera_gains(exposures, options, share)
+    found = [kept and kept.get(exposure) for exposure in exposures]
+    left = [i for i, one in enumerate(found) if one is None]
+    use_compiled_loops(sum(np.prod(exposures[i].shape) for i in left))
+    gains = {} if options.gain or not left else _camera_gains(exposures, options, share)
 
     def measured(which, options):
         pairs = [(exposure, gains.get(exposure.name)) for exposure in which]
-        return list(share(partial(_measure_with_gain, options=options), pairs, description="measuring"))
+        return share(partial(_measure_with_gain, options=options), pairs, description="measuring")
 
-    found = measured(exposures, options)
+    for i, one in zip(left, measured([exposures[i] for i in left], options), strict=True):
+        found[i] = one
+        if kept:
+            kept.keep(exposures[i], one)
     votes = [one.verdict.psf == "effective" for one in found if one.verdict.decided]
     if options.psf == "auto" and any(votes) and not all(votes):  # one definition of the centre for all exposures
         chosen = "effective" if np.mean(votes) > 0.5 else "moffat"
@@ -410,45 +417,6 @@ def _tell_of_all(found):
 
 def _fwhm(one):
     return float(moffat.fwhm(one.shape))
-
-
-class MeasuredExposure(NamedTuple):
-    """Detections of one exposure.
-
-    Attributes
-    ----------
-    table : `~astropy.table.QTable`
-        As from `measure`.
-    photon : float or None
-        Variance per unit of star light if it had to be estimated, for want of a gain.
-    psf : `~legdistort.measurement.effective.model.EffectivePSF` or None
-        None if Moffat profiles were fitted.
-    verdict : `~legdistort.measurement.effective.frame_psf.Verdict`
-    noise_ratio : float or None
-        Of the noise seen to that which the gain implies, where that is doubtful (`camera_gain.contradiction`).
-    shape : ndarray, shape (4,), or None
-        Of its stars.
-    hidden : bool
-        Whether its mask hides most bright stars.
-    factor_error : float
-        Relative error common to all fluxes, see `legdistort.measurement.effective.total_light`.
-    """
-
-    table: QTable
-    photon: float | None
-    psf: EffectivePSF | None
-    verdict: frame_psf.Verdict
-    noise_ratio: float | None = None
-    shape: np.ndarray | None = None
-    hidden: bool = False
-    factor_error: float = 0.0
-
-    def in_unit(self, unit):
-        """The same in a unit of light that is so many times larger."""
-        table = self.table.copy()
-        for name in ("flux", "flux_err"):
-            table[name] = table[name] / unit
-        return self._replace(table=table, photon=self.photon and self.photon / unit)
 
 
 def measure_scaled(exposure, options):

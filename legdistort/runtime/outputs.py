@@ -13,6 +13,7 @@ folder, and would write elsewhere.
 
 import ctypes
 import hashlib
+import json
 import logging
 import os
 import shlex
@@ -531,6 +532,20 @@ def contents(folder):
     """``{name: SHA-256}`` of the files in a folder and those below it, without what could not be removed."""
     files = {path.relative_to(folder).as_posix(): path for path in sorted(Path(folder).rglob("*")) if path.is_file()}
     return {name: checksum_of(path) for name, path in files.items() if f"/{_PARTIAL}" not in f"/{name}"}
+
+
+def listed_files(folder):
+    """The entries of a summary on the files beside it: an identifier of the run, and ``{name: SHA-256}``.
+
+    A file with another checksum shows a program that results of two runs are mixed there.
+    """
+    return {"run": uuid.uuid4().hex, "files": contents(folder)}
+
+
+def write_summary(path, summary):
+    """Write figures as JSON, in the place of those that are there."""
+    with replacing(path, overwrite=True) as file:
+        file.write(f"{json.dumps(summary, indent=1)}\n".encode())
 
 
 def _sync(path):

@@ -135,7 +135,7 @@ def test_what_was_measured_is_kept_of_files_alone_and_once(night, tmp_path, monk
     with pytest.raises(KeyboardInterrupt):
         legdistort.run(paths, **asked)
     assert f"what was measured is kept in {tmp_path}/out.measured" in caplog.text
-    monkeypatch.setattr("legdistort.pipeline.write_detections", full)
+    monkeypatch.setattr("legdistort.measurement.unfinished.write_detections", full)
     shutil.rmtree(tmp_path / "out.measured")
     with pytest.raises(KeyboardInterrupt):
         legdistort.run(paths, **asked)

@@ -22,11 +22,10 @@ from legdistort.inputs.exposures import Exposure
 from legdistort.inputs.references.catalogue import read_reference
 from legdistort.inputs.table_files import read_table, write_stars
 from legdistort.measurement.noise_curves import NoiseCurves
-from legdistort.pipeline import write_summary
 from legdistort.priors.prior import Prior
 from legdistort.reporting.page import write_report
 from legdistort.results.solution import Solution
-from legdistort.runtime import asdf_files
+from legdistort.runtime import asdf_files, outputs
 from legdistort.simulation.observations import SimulatedExposures, simulate_exposures, simulate_matches
 from legdistort.solving.estimation import solve
 from legdistort.wcs.attachment import attach
@@ -160,8 +159,8 @@ def test_report_and_summary(solution, place, alone, monkeypatch):
     monkeypatch.setattr("legdistort.reporting.page.render", lambda *_, **__: "Ä")  # its pictures take their time
     write_report(place / "r#.html", solution)
     assert (place / "r#.html").read_text(encoding="utf-8") == "Ä"
-    write_summary(place / "s#.json", {"a": 1})
-    write_summary(place / "s#.json", {"a": 2})
+    outputs.write_summary(place / "s#.json", {"a": 1})
+    outputs.write_summary(place / "s#.json", {"a": 2})
     assert (place / "s#.json").read_text() == '{\n "a": 2\n}\n'
     alone("r#.html", "s#.json")
 

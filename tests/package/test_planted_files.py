@@ -37,7 +37,7 @@ def solved(tmp_path_factory):
     solution = ld.solve(matches, degree=1)
     pipeline.write_results(solution, folder)
     write_table(matches.table, folder / "detections.ecsv")
-    pipeline.write_summary(folder / "summary.json", pipeline.listed_files(folder))
+    outputs.write_summary(folder / "summary.json", outputs.listed_files(folder))
     return folder
 
 
