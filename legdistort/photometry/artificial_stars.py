@@ -199,7 +199,7 @@ def _found_again(field, known, xy, flux, threshold, rng):
     places, light = np.vstack([xy, field.xy[beside]]), np.append(flux, field.flux[beside])
     with field.restored(), _put_in(field, xy, flux, rng):
         near = tree.query(field.xy)[0] < _BLENDED * field.fwhm
-        field.remove(near & (cKDTree(known).query(field.xy)[0] > SAME * field.fwhm))
+        field.remove(near & ~field.wide & (cKDTree(known).query(field.xy)[0] > SAME * field.fwhm))
         measure_again(field, threshold, xy)
         row = matched(places, light, field.xy, field.fwhm)[: len(xy)]
         there, row = row >= 0, row[row >= 0]
