@@ -214,9 +214,9 @@ def _put_in(field, xy, flux, rng):
     """The light of stars with its photon noise in all exposures, through their maps and by their own PSFs."""
     before = []
     for layer in field.layers:
-        scene, (place, there) = layer.scene, layer.local(xy)
+        scene, (pixel, there) = layer.scene, layer.local(xy)
         signal, half = scene.frame.signal, _WIDE * scene.half
-        pixel = place.pixel[there]
+        pixel = pixel[there]
         centres = np.round(pixel).astype(int)
         params = np.column_stack([pixel - centres, layer.transmission * flux[there]])
         light = with_photons(scene.psf.light(params, centres, half).astype(float), scene.photon, rng)

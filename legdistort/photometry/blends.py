@@ -30,7 +30,7 @@ def pairs(field, rows):
         total[there] += gain
         better = gain > best[there]
         best[there[better]] = gain[better]
-        back = np.linalg.inv(layer.places.place(field.xy[rows[there]]).slopes[better])
+        back = np.linalg.inv(layer.places.slopes(field.xy[rows[there[better]]]))
         step = params[better, :, :2] - layer.scene.xy[own[better]][:, None]
         out[there[better], :, :2] = field.xy[rows[there[better]]][:, None] + np.einsum("nab,nkb->nka", back, step)
         out[there[better], :, 2] = params[better, :, 2] / layer.transmission

@@ -65,11 +65,11 @@ class _Groups:
 
     def light(self, layer, centres, params, xy):
         """Light of sources (m, 6) on stamps of an image, and its derivatives (m, 6, npix)."""
-        place = layer.local(xy + params[:, :2])[0]
+        xy = xy + params[:, :2]
         root = np.zeros((len(params), 2, 2))
         root[:, *_ROOT] = params[:, 3:]
-        own = np.column_stack([place.pixel - centres, layer.transmission * params[:, 2]])
-        scene, slopes = layer.scene, place.slopes
+        own = np.column_stack([layer.local(xy)[0] - centres, layer.transmission * params[:, 2]])
+        scene, slopes = layer.scene, layer.places.slopes(xy)
         if root.any():
             light, by, by_spread = spread_light(scene.psf, own, slopes @ root, centres, scene.half, slopes=True)
         else:
@@ -102,7 +102,7 @@ class _Groups:
         for layer, there, centres, data, weights, _ in self.images:
             light = self.light(layer, centres, params[there], self.xy[there])[0]
             left, middle = data - light, light.shape[1] // 2
-            near = layer.scene.near(layer.local(self.xy[there] + params[there, :2])[0].pixel - centres) & (weights > 0)
+            near = layer.scene.near(layer.local(self.xy[there] + params[there, :2])[0] - centres) & (weights > 0)
             core = (near * light * weights * left**2).sum(axis=1) / np.maximum((near * light).sum(axis=1), 1e-30)
             own = (weights * light**2).sum(axis=1)
             chi2[there], information[there] = chi2[there] + own * core, information[there] + own

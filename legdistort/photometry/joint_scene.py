@@ -75,11 +75,11 @@ class Layer:
     trusted: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def local(self, xy):
-        """`Place` of stars (n, 2) as its scene counts, and whether their light reaches it."""
-        place = self.places.place(xy)
-        pixel = place.pixel - (self.scene.psf.centre(np.nan_to_num(place.pixel)) if len(xy) else 0)
+        """Pixels of stars (n, 2) as its scene counts, and whether their light reaches it."""
+        pixel = self.places.pixels(xy)
+        pixel = pixel - (self.scene.psf.centre(np.nan_to_num(pixel)) if len(xy) else 0)
         reach, size = self.scene.half, np.array(self.scene.light.shape[::-1])
-        return place._replace(pixel=pixel), ((pixel > -reach) & (pixel < size - 1 + reach)).all(axis=1)
+        return pixel, ((pixel > -reach) & (pixel < size - 1 + reach)).all(axis=1)
 
     @property
     def stars(self):
@@ -139,12 +139,12 @@ class JointScene(JointFit):
         self.xy, self.flux = np.vstack([self.xy, xy]), np.append(self.flux, flux)
         self.spread = np.concatenate([self.spread, np.zeros((len(flux), 2, 2))])
         for layer in self.layers:
-            place, there = layer.local(xy)
+            pixel, there = layer.local(xy)
             new = np.full(len(flux), -1)
             new[there] = len(layer.scene.flux) + np.arange(there.sum())
             layer.rows = np.append(layer.rows, new)
             layer.trusted = np.append(layer.trusted, np.ones(len(flux), dtype=bool))
-            layer.scene.add(place.pixel[there], layer.transmission * flux[there])
+            layer.scene.add(pixel[there], layer.transmission * flux[there])
 
     def remove(self, rows):
         """Stars taken off; a mask (n,)."""
@@ -161,15 +161,15 @@ class JointScene(JointFit):
             self.spread[rows] = spread
         for layer in self.layers:
             own = layer.rows[rows]
-            place, there = layer.local(self.xy[rows])
-            there = (own >= 0) & np.isfinite(place.pixel).all(axis=1)
-            its = None if spread is None else place.slopes[there] @ spread[there]
-            layer.scene.set(own[there], place.pixel[there], layer.transmission * self.flux[rows][there], its)
+            pixel = layer.local(self.xy[rows])[0]
+            there = (own >= 0) & np.isfinite(pixel).all(axis=1)
+            its = None if spread is None else layer.places.slopes(self.xy[rows[there]]) @ spread[there]
+            layer.scene.set(own[there], pixel[there], layer.transmission * self.flux[rows][there], its)
 
     def refresh(self):
         """All stars put once more where PSFs and transmissions have them."""
         for layer in self.layers:
-            pixel = layer.local(self.xy[layer.stars])[0].pixel
+            pixel = layer.local(self.xy[layer.stars])[0]
             known = np.isfinite(pixel).all(axis=1)
             layer.scene.xy[known] = pixel[known]
             layer.scene.flux = layer.transmission * self.flux[layer.stars]
@@ -195,9 +195,7 @@ class JointScene(JointFit):
 
     def contains(self, xy):
         """Whether places (n, 2) lie in any image."""
-        return np.any(
-            [layer.scene.contains(np.nan_to_num(layer.local(xy)[0].pixel, nan=-99)) for layer in self.layers], 0
-        )
+        return np.any([layer.scene.contains(np.nan_to_num(layer.local(xy)[0], nan=-99)) for layer in self.layers], 0)
 
     # -- the fit
 
@@ -209,7 +207,7 @@ class JointScene(JointFit):
             if len(there):
                 (i, j, blocks), side = layer.scene.blocks(own)
                 through = np.zeros((len(there), 3, 3))
-                slopes = np.nan_to_num(layer.places.place(self.xy[rows[there]]).slopes)
+                slopes = np.nan_to_num(layer.places.slopes(self.xy[rows[there]]))
                 through[:, :2, :2] = np.where(layer.trusted[rows[there], None, None], slopes, 0)
                 through[:, 2, 2] = layer.transmission
                 parts.append((there[i], there[j], through[i].mT @ blocks @ through[j]))
@@ -242,8 +240,8 @@ class JointScene(JointFit):
         """
         total = np.zeros(len(xy))
         for layer in self.layers:
-            place, there = layer.local(xy)
-            square = layer.scene.unit_snr(place.pixel[there]) ** 2
+            pixel, there = layer.local(xy)
+            square = layer.scene.unit_snr(pixel[there]) ** 2
             seen = square > _LEAST * layer.scene.usual_information
             total[there] += np.where(seen, layer.transmission**2 * square, 0)
         return np.sqrt(total)
@@ -272,8 +270,8 @@ class JointScene(JointFit):
         """Sum of the squared residuals within a core of some places of the plane, in units of the noise; (n,)."""
         total = np.zeros(len(places))
         for layer in self.layers:
-            place, there = layer.local(places)
-            total[there] += layer.scene.chi2_around(place.pixel[there])
+            pixel, there = layer.local(places)
+            total[there] += layer.scene.chi2_around(pixel[there])
         return total
 
     def fluxes(self, layer, rows=None):

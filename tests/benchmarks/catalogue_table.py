@@ -5,13 +5,12 @@ Eleven deep frames of 640 x 640 px, 900 stars of a signal-to-noise ratio of 0.8 
 random dithers and distortions, rendered without the package; measured, matched and solved, then `legdistort.catalogue`.
 For every part of pixels hit by cosmic rays: stars that single frames show (`run`), rows; the part of the true stars
 found above 6, from 6 to 7 and above 8 (ratios of all frames together, neighbours known); false rows, within a FWHM of
-no star above 3, and rows that pass for galaxies;
-rms of deviations over the joint bound (everything about all stars unknown) and over the stated errors,
-above 8 and from 5 to 8; processor seconds of measuring and of the catalogue. With ``--cost`` eleven frames of
-2048 x 2048 px with 9200 stars: seconds alone (set OPENBLAS_NUM_THREADS=1). With ``--artificial`` so many stars are put
-into each of the sets without hits, and nothing else is shown: the part found of those and of true stars, and the
-difference; the median excess of the fluxes of rows over their errors, as ``flux_bias`` states it and as it is; by ratio
-of signal to noise. Below: false rows of a million pixels, those of negative light and those that are false.
+no star above 3, and rows that pass for galaxies; rms of deviations over the joint bound (everything about all stars
+unknown) and over the stated errors, above 8 and from 5 to 8; processor seconds of measuring and of the catalogue. With
+``--cost`` eleven frames of 2048 x 2048 px with 9200 stars: seconds alone (set OPENBLAS_NUM_THREADS=1). With
+``--artificial`` so many stars are put into each of the sets without hits, and nothing else is shown: the part found of
+those and of true stars, and the difference; the median excess of the fluxes of rows over their errors, as ``flux_bias``
+states it and as it is; by ratio of signal to noise. Below: false rows of a million pixels, those of negative light and those that are false.
 """
 
 import argparse
