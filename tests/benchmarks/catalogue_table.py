@@ -10,7 +10,8 @@ unknown) and over the stated errors, above 8 and from 5 to 8; processor seconds 
 ``--cost`` eleven frames of 2048 x 2048 px with 9200 stars: seconds alone (set OPENBLAS_NUM_THREADS=1). With
 ``--artificial`` so many stars are put into each of the sets without hits, and nothing else is shown: the part found of
 those and of true stars, and the difference; the median excess of the fluxes of rows over their errors, as ``flux_bias``
-states it and as it is; by ratio of signal to noise. Below: false rows of a million pixels, those of negative light and those that are false.
+states it and as it is; by ratio of signal to noise. Below: false rows of a million pixels, those of negative light
+and those that are false.
 """
 
 import argparse
