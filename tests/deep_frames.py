@@ -77,7 +77,7 @@ def deep_frames(seed, *, size=640, n_stars=900, n_frames=11, transmission=None, 
         if bounds:
             _inform(information, stamps, variance)
         data = image + LEVEL + rng.normal(0, 1, image.shape) * np.sqrt(variance)
-        frames.append(_with_hits(rng, data, hit).astype(np.float32))
+        frames.append(with_hits(rng, data, hit).astype(np.float32))
     pixels, slopes = (np.array(each) for each in zip(*maps, strict=True))
     known = _bounds(information, flux) if bounds else (np.full((n_stars, 3), np.nan), np.full(n_stars, np.nan))
     return DeepFrames(frames, xy, flux, pixels, slopes, t, *known)
@@ -112,7 +112,7 @@ def _inform(information, stamps, variance):
                 information[j, :, i, :] += both.T
 
 
-def _with_hits(rng, data, part):
+def with_hits(rng, data, part):
     """Cosmic rays: tracks of one to four pixels of 50 to 5000 e-."""
     n = rng.poisson(part * data.size / 2.5)
     y, x = rng.integers(0, data.shape[0], n), rng.integers(0, data.shape[1], n)
@@ -225,3 +225,49 @@ def excess(truth, compared, stars):
     off = np.asarray(rows["flux"]) - flux_level(truth, compared, stars) * truth.flux[compared.star[use]]
     stated = rows["flux_bias"] if "flux_bias" in stars.colnames else np.full(len(rows), np.nan)
     return np.array([rows["snr"], off / rows["flux_err"], stated / rows["flux_err"]])
+
+
+def with_galaxies(truth, xy, snr, radius, *, ratio=0.7, seed=0):
+    """The frames of `DeepFrames` with exponential discs at places (n, 2) of the plane, through the same maps.
+
+    Parameters
+    ----------
+    snr : array_like, shape (n,)
+        Ratio of signal to noise that a star of their light has in one frame.
+    radius : array_like, shape (n,)
+        Half-light radius [px] before the light is spread by the PSF.
+    ratio : float
+        Of the axes.
+    """
+    rng, size, frames = np.random.default_rng(seed), truth.frames[0].shape[0], []
+
+    def terms(xy):
+        u, v = (xy / (size - 1) * 2 - 1).T
+        return np.stack([u**i * v**j for i in range(4) for j in range(4 - i)], axis=1)
+
+    angles = rng.uniform(0, np.pi, len(xy))
+    for data, pixels, t in zip(truth.frames, truth.pixels, truth.transmission, strict=True):
+        data = data.astype(float)
+        places = terms(np.asarray(xy)) @ np.linalg.lstsq(terms(truth.xy), pixels, rcond=None)[0]
+        for place, s, r, angle in zip(places, snr, radius, angles, strict=True):
+            image, window = _disc(place, r, ratio, angle, size)
+            image *= t * s * SKY * np.sqrt(4 * np.pi) * SIGMA
+            data[window] += image + rng.normal(0, 1, image.shape) * np.sqrt(image)
+        frames.append(data.astype(np.float32))
+    return frames
+
+
+def _disc(place, radius, ratio, angle, size, n=(60, 36)):
+    """An exponential disc of unit light, as many points, and the rows and columns of it."""
+    share = (np.arange(n[0]) + 0.5) / n[0]  # of the light within
+    r = np.interp(share, 1 - (1 + (x := np.linspace(0, 12, 2000))) * np.exp(-x), x) * radius / 1.678
+    a = (np.arange(n[1]) + 0.5) / n[1] * 2 * np.pi
+    u, v = (r[:, None] * np.cos(a)).ravel(), ratio * (r[:, None] * np.sin(a)).ravel()
+    x, y = place[0] + u * np.cos(angle) - v * np.sin(angle), place[1] + u * np.sin(angle) + v * np.cos(angle)
+    reach = int(5 * radius) + _HALF
+    columns, rows = (np.arange(max(0, round(c) - reach), min(size, round(c) + reach + 1)) for c in place)
+    a, b = (
+        (erf((g + 0.5 - c[:, None]) / SIGMA / 2**0.5) - erf((g - 0.5 - c[:, None]) / SIGMA / 2**0.5)) / 2
+        for c, g in ((x, columns), (y, rows))
+    )
+    return b.T @ a / len(x), np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]

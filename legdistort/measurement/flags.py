@@ -22,6 +22,9 @@ class Flag(IntFlag):
     DEFECT = 512  #: a hot pixel, a bad column or a cosmic ray within one FWHM of the centre was left out of the fit
     VARIABLE = 1024  #: in a catalogue: its fluxes scatter by more than their errors, and two exposures confirm it
     DISPLACED = 2048  #: in a catalogue: more than five errors from where the solution has it
+    EXTENDED = (
+        4096  #: in a catalogue: wider than the stars of its flux; its light is that of a PSF spread by a Gaussian
+    )
 
 
 #: Flags that make a detection useless as a star position.

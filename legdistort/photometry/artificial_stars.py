@@ -199,7 +199,7 @@ def _found_again(field, known, xy, flux, threshold, rng):
     places, light = np.vstack([xy, field.xy[beside]]), np.append(flux, field.flux[beside])
     with field.restored(), _put_in(field, xy, flux, rng):
         near = tree.query(field.xy)[0] < _BLENDED * field.fwhm
-        field.remove(near & (cKDTree(known).query(field.xy)[0] > SAME * field.fwhm))
+        field.remove(near & ~field.wide & (cKDTree(known).query(field.xy)[0] > SAME * field.fwhm))
         measure_again(field, threshold, xy)
         row = matched(places, light, field.xy, field.fwhm)[: len(xy)]
         there, row = row >= 0, row[row >= 0]
@@ -214,9 +214,9 @@ def _put_in(field, xy, flux, rng):
     """The light of stars with its photon noise in all exposures, through their maps and by their own PSFs."""
     before = []
     for layer in field.layers:
-        scene, (place, there) = layer.scene, layer.local(xy)
+        scene, (pixel, there) = layer.scene, layer.local(xy)
         signal, half = scene.frame.signal, _WIDE * scene.half
-        pixel = place.pixel[there]
+        pixel = pixel[there]
         centres = np.round(pixel).astype(int)
         params = np.column_stack([pixel - centres, layer.transmission * flux[there]])
         light = with_photons(scene.psf.light(params, centres, half).astype(float), scene.photon, rng)

@@ -18,7 +18,7 @@ def pairs(field, rows):
     params : ndarray, shape (n, 2, 3)
         x, y [pix] of the reference plane, flux.
     gain : ndarray, shape (n,)
-        By how much chi2 falls, summed over the exposures.
+        By how much chi2 falls, summed over the exposures; 0 for sources that are wider than stars.
     """
     out, total, best = np.zeros((len(rows), 2, 3)), np.zeros(len(rows)), np.zeros(len(rows))
     for layer in field.layers:
@@ -30,8 +30,8 @@ def pairs(field, rows):
         total[there] += gain
         better = gain > best[there]
         best[there[better]] = gain[better]
-        back = np.linalg.inv(layer.places.place(field.xy[rows[there]]).slopes[better])
+        back = np.linalg.inv(layer.places.slopes(field.xy[rows[there[better]]]))
         step = params[better, :, :2] - layer.scene.xy[own[better]][:, None]
         out[there[better], :, :2] = field.xy[rows[there[better]]][:, None] + np.einsum("nab,nkb->nka", back, step)
         out[there[better], :, 2] = params[better, :, 2] / layer.transmission
-    return out, total
+    return out, np.where(field.wide[rows], 0, total)

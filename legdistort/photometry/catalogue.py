@@ -61,7 +61,8 @@ class Catalogue(ShownAsPrinted):
         the exposures; ``n`` images that see it, of which ``n_left_out`` do not tell where it is, as in the
         solution; ``snr`` where nothing but the flux is unknown; ``chi2_dof`` of the
         core; ``sharpness``, what is left in the central pixel over what the PSF has there; ``crowding``; ``flags``
-        (`legdistort.measurement.flags.Flag`): what is so in every image that sees it, BLENDED, VARIABLE, DISPLACED.
+        (`legdistort.measurement.flags.Flag`): what is so in every image that sees it, BLENDED, VARIABLE, DISPLACED,
+        EXTENDED.
         ``meta["noise_peaks"]`` is the number of peaks of noise alone to be expected above the threshold.
     photometry : `~astropy.table.QTable`
         One row a star and image that sees it: ``star``, ``exposure`` (and ``detector``), ``flux``, ``flux_err``,

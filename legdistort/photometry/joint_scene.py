@@ -75,11 +75,11 @@ class Layer:
     trusted: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def local(self, xy):
-        """`Place` of stars (n, 2) as its scene counts, and whether their light reaches it."""
-        place = self.places.place(xy)
-        pixel = place.pixel - (self.scene.psf.centre(np.nan_to_num(place.pixel)) if len(xy) else 0)
+        """Pixels of stars (n, 2) as its scene counts, and whether their light reaches it."""
+        pixel = self.places.pixels(xy)
+        pixel = pixel - (self.scene.psf.centre(np.nan_to_num(pixel)) if len(xy) else 0)
         reach, size = self.scene.half, np.array(self.scene.light.shape[::-1])
-        return place._replace(pixel=pixel), ((pixel > -reach) & (pixel < size - 1 + reach)).all(axis=1)
+        return pixel, ((pixel > -reach) & (pixel < size - 1 + reach)).all(axis=1)
 
     @property
     def stars(self):
@@ -111,6 +111,8 @@ class JointScene(JointFit):
     ----------
     xy, flux : ndarray, shape (n, 2), (n,)
         Of the stars, in the reference plane; the flux is that in an exposure of transmission 1.
+    spread : ndarray, shape (n, 2, 2)
+        Of sources wider than stars, as of `legdistort.measurement.scene.extended.spread_light`; 0 for stars.
     rejected : int
         Peaks of the last look that did not stand without their strongest exposure.
     area : int
@@ -122,21 +124,27 @@ class JointScene(JointFit):
     def __init__(self, layers, grid, *, progress=False):
         self.layers, self.grid, self.rejected, self.area = Layers(layers), grid, 0, 0
         self.progress = progress
-        self.xy, self.flux = np.zeros((0, 2)), np.zeros(0)
+        self.xy, self.flux, self.spread = np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2))
         self.fwhm = float(np.median([each.scene.fwhm / _scale(each) for each in layers]))
+
+    @property
+    def wide(self):
+        """Sources wider than stars, a mask (n,)."""
+        return self.spread.any(axis=(1, 2))
 
     # -- stars come and go
 
     def add(self, xy, flux):
         """More stars."""
         self.xy, self.flux = np.vstack([self.xy, xy]), np.append(self.flux, flux)
+        self.spread = np.concatenate([self.spread, np.zeros((len(flux), 2, 2))])
         for layer in self.layers:
-            place, there = layer.local(xy)
+            pixel, there = layer.local(xy)
             new = np.full(len(flux), -1)
             new[there] = len(layer.scene.flux) + np.arange(there.sum())
             layer.rows = np.append(layer.rows, new)
             layer.trusted = np.append(layer.trusted, np.ones(len(flux), dtype=bool))
-            layer.scene.add(place.pixel[there], layer.transmission * flux[there])
+            layer.scene.add(pixel[there], layer.transmission * flux[there])
 
     def remove(self, rows):
         """Stars taken off; a mask (n,)."""
@@ -144,21 +152,24 @@ class JointScene(JointFit):
             layer.scene.remove(rows[layer.stars])
             layer.rows, layer.trusted = layer.rows[~rows], layer.trusted[~rows]
             layer.rows[layer.stars] = np.arange(len(layer.scene.flux))
-        self.xy, self.flux = self.xy[~rows], self.flux[~rows]
+        self.xy, self.flux, self.spread = self.xy[~rows], self.flux[~rows], self.spread[~rows]
 
-    def set(self, rows, xy, flux):
-        """Other positions and fluxes of some stars."""
+    def set(self, rows, xy, flux, spread=None):
+        """Other positions and fluxes of some stars, perhaps another spread."""
         self.xy[rows], self.flux[rows] = xy, flux
+        if spread is not None:
+            self.spread[rows] = spread
         for layer in self.layers:
             own = layer.rows[rows]
-            place, there = layer.local(self.xy[rows])
-            there = (own >= 0) & np.isfinite(place.pixel).all(axis=1)
-            layer.scene.set(own[there], place.pixel[there], layer.transmission * self.flux[rows][there])
+            pixel = layer.local(self.xy[rows])[0]
+            there = (own >= 0) & np.isfinite(pixel).all(axis=1)
+            its = None if spread is None else layer.places.slopes(self.xy[rows[there]]) @ spread[there]
+            layer.scene.set(own[there], pixel[there], layer.transmission * self.flux[rows][there], its)
 
     def refresh(self):
         """All stars put once more where PSFs and transmissions have them."""
         for layer in self.layers:
-            pixel = layer.local(self.xy[layer.stars])[0].pixel
+            pixel = layer.local(self.xy[layer.stars])[0]
             known = np.isfinite(pixel).all(axis=1)
             layer.scene.xy[known] = pixel[known]
             layer.scene.flux = layer.transmission * self.flux[layer.stars]
@@ -167,25 +178,24 @@ class JointScene(JointFit):
     @contextmanager
     def restored(self):
         """Stars may come and go: they are as before afterwards."""
-        own, before = (self.xy, self.flux), []
+        own, before = (self.xy, self.flux, self.spread), []
         for each in self.layers:
             scene = each.scene
-            before.append((each.rows, each.trusted, scene.xy, scene.flux))
-            each.rows, each.trusted, scene.xy, scene.flux = (values.copy() for values in before[-1])
-        self.xy, self.flux = (values.copy() for values in own)
+            before.append((each.rows, each.trusted, scene.xy, scene.flux, scene.spread))
+            each.rows, each.trusted, scene.xy, scene.flux, scene.spread = (values.copy() for values in before[-1])
+        self.xy, self.flux, self.spread = (values.copy() for values in own)
         try:
             yield
         finally:
-            self.xy, self.flux = own
+            self.xy, self.flux, self.spread = own
             for each, values in zip(self.layers, before, strict=True):
-                each.rows, each.trusted, each.scene.xy, each.scene.flux = values
-                each.scene.render()
+                scene = each.scene
+                each.rows, each.trusted, scene.xy, scene.flux, scene.spread = values
+                scene.render()
 
     def contains(self, xy):
         """Whether places (n, 2) lie in any image."""
-        return np.any(
-            [layer.scene.contains(np.nan_to_num(layer.local(xy)[0].pixel, nan=-99)) for layer in self.layers], 0
-        )
+        return np.any([layer.scene.contains(np.nan_to_num(layer.local(xy)[0], nan=-99)) for layer in self.layers], 0)
 
     # -- the fit
 
@@ -197,7 +207,7 @@ class JointScene(JointFit):
             if len(there):
                 (i, j, blocks), side = layer.scene.blocks(own)
                 through = np.zeros((len(there), 3, 3))
-                slopes = np.nan_to_num(layer.places.place(self.xy[rows[there]]).slopes)
+                slopes = np.nan_to_num(layer.places.slopes(self.xy[rows[there]]))
                 through[:, :2, :2] = np.where(layer.trusted[rows[there], None, None], slopes, 0)
                 through[:, 2, 2] = layer.transmission
                 parts.append((there[i], there[j], through[i].mT @ blocks @ through[j]))
@@ -230,8 +240,8 @@ class JointScene(JointFit):
         """
         total = np.zeros(len(xy))
         for layer in self.layers:
-            place, there = layer.local(xy)
-            square = layer.scene.unit_snr(place.pixel[there]) ** 2
+            pixel, there = layer.local(xy)
+            square = layer.scene.unit_snr(pixel[there]) ** 2
             seen = square > _LEAST * layer.scene.usual_information
             total[there] += np.where(seen, layer.transmission**2 * square, 0)
         return np.sqrt(total)
@@ -241,6 +251,12 @@ class JointScene(JointFit):
         weights = self._by_layer(lambda scene, own: scene.snr(own) ** 2, rows)
         chi2 = self._by_layer(lambda scene, own: scene.core_chi2(own), rows)
         return (weights * chi2).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-30)
+
+    def sharpness(self, rows=None):
+        """What is left in central pixels over what the PSF has there, of all stars or some, and its error; (n,)."""
+        left = self._by_layer(lambda scene, own: scene.middles(own)[0], rows).sum(axis=0)
+        norm = np.maximum(self._by_layer(lambda scene, own: scene.middles(own)[1], rows).sum(axis=0), 1e-30)
+        return left / norm, norm**-0.5
 
     def _by_layer(self, function, rows):
         """Values of ``function(scene, rows of the scene)`` for stars, all or some, by layer, (m, n)."""
@@ -254,8 +270,8 @@ class JointScene(JointFit):
         """Sum of the squared residuals within a core of some places of the plane, in units of the noise; (n,)."""
         total = np.zeros(len(places))
         for layer in self.layers:
-            place, there = layer.local(places)
-            total[there] += layer.scene.chi2_around(place.pixel[there])
+            pixel, there = layer.local(places)
+            total[there] += layer.scene.chi2_around(pixel[there])
         return total
 
     def fluxes(self, layer, rows=None):

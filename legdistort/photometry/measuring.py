@@ -14,6 +14,7 @@ from ..measurement.scene.search import search
 from ..measurement.scene.shared_psf import moffat_field
 from . import transmissions
 from .blends import pairs
+from .extended_sources import merge_extended
 from .joint_scene import CONFIRMED, LESS
 
 _DEGREE = 2  # of the shape of the stars over a frame
@@ -24,6 +25,8 @@ _CLOSE = 2.0  # FWHM of blended stars
 # standard deviations of a pixel in the core of a star that is too bright in one exposure alone, and of those beside it
 _DEVIATES, _SKIRT = 4.0, 2.0
 _SEARCHED = 3.0  # FWHM from a place around which it was searched
+# chi2 of the core of a faint source that is no star's; sharpness that is none's, and so many errors of it more
+_NO_STAR, _SHARP = 2.5, (0.5, 5.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,16 +78,22 @@ def measure_field(field, xy, left_out, threshold):
     """
     transmissions.start(field, xy, left_out)
     search(field, threshold, _retune, pairs)
+    places = merge_extended(field)
+    if len(places):
+        search(field, threshold, None, pairs, settled=True, around=places)
     field.update_sky()
     errors, rejected = transmissions.update(field), field.rejected
     changed, first = np.ones(len(field.flux), dtype=bool), True
     while changed.any():
         field.fit(changed, 2)
         rows, (gone, wrong) = np.flatnonzero(changed), np.zeros((2, len(changed)), dtype=bool)
-        gone[rows], _, spoiled = _by_fluxes(field, threshold, rows)[2]
+        flux, error, (gone[rows], _, spoiled) = _by_fluxes(field, threshold, rows)
+        few, unlike = _few(field, error, rows)
         if first:  # once: what is left of a star that follows no PSF would be taken off pixel by pixel
-            wrong[rows] = _masked(field, rows, spoiled)
+            wrong[rows] = _masked(field, rows, spoiled | (unlike & np.isfinite(error)))
             first = False
+        else:
+            gone[rows] |= unlike | (few & (field.snr(rows) < threshold))
         changed = _near(field.xy[~gone], field.xy[gone | wrong], _SEARCHED * field.fwhm)
         field.remove(gone)
         rejected += int(gone.sum())
@@ -116,7 +125,8 @@ def measure_again(field, threshold, around=None):
     while True:
         near = np.ones(len(field.flux), dtype=bool) if around is None else _near(field.xy, around, reach)
         rows, gone = np.flatnonzero(near), np.zeros(len(near), dtype=bool)
-        gone[rows] = _by_fluxes(field, threshold, rows)[2][0]
+        _, error, (lone, _, _) = _by_fluxes(field, threshold, rows)
+        gone[rows] = lone | _few(field, error, rows)[1]
         if not gone.any():
             return
         field.remove(gone)
@@ -127,6 +137,16 @@ def _by_fluxes(field, threshold, rows=None):
     flux, error = by_image(field, rows)
     mean = field.flux if rows is None else field.flux[rows]
     return flux, error, judged(flux, error, mean, field.snr(rows), threshold)
+
+
+def _few(field, error, rows):
+    """Stars that too few images see to be judged by fluxes, and those of them that pixels show to be none; (n,)."""
+    few = np.isfinite(error).sum(axis=0) < CONFIRMED
+    unlike, some = few.copy(), rows[few]
+    sharp, its = field.sharpness(some)
+    unlike[few] = (field.core_chi2(some) > _NO_STAR) & (field.snr(some) < _FAINT)
+    unlike[few] |= sharp > _SHARP[0] + _SHARP[1] * its
+    return few, unlike
 
 
 def _masked(field, rows, spoiled):
@@ -233,7 +253,8 @@ def star_flags(field, measured):
     common = np.bitwise_and.reduce(flags, axis=0) if len(flags) else flags
     common = np.where(measured.seen.any(axis=0), common, 0)
     near = cKDTree(field.xy).query(field.xy, k=2)[0][:, 1] < _CLOSE * field.fwhm
-    return common | np.where(near, Flag.BLENDED, 0) | np.where(measured.varying, Flag.VARIABLE, 0)
+    own = ((near, Flag.BLENDED), (measured.varying, Flag.VARIABLE), (field.wide, Flag.EXTENDED))
+    return common | np.sum([np.where(rows, flag, 0) for rows, flag in own], axis=0)
 
 
 def covariances(field, threshold, rows=None):
@@ -267,19 +288,3 @@ def map_covariances(field):
         relative[stars] += (weight[stars] ** 2)[:, None, None] * own
         common[stars] += weight[stars, None, None] * (absolute - own)
     return relative, relative + common
-
-
-def sharpness(field):
-    """What is left in the central pixels over what the PSF has there, weighted by the information; (n,)."""
-    total, norm = np.zeros((2, len(field.flux)))
-    for layer in field.layers:
-        scene = layer.scene
-        if not len(layer.stars):
-            continue
-        params, centres = scene.stars(np.arange(len(scene.flux)))
-        own = scene.psf.light(params, centres, 0)[:, 0]
-        x, y = np.clip(centres, 0, np.array(scene.light.shape[::-1]) - 1).T
-        weight = np.where((x == centres[:, 0]) & (y == centres[:, 1]), scene.weights[y, x], 0)
-        total[layer.stars] += weight * own * scene.residual[y, x]
-        norm[layer.stars] += weight * own**2
-    return total / np.maximum(norm, 1e-30)

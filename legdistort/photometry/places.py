@@ -1,27 +1,10 @@
 """Where the reference plane lies on an image, and how well that is known: all that measuring sees of a solution."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from ..geometry import star_hull
 
 _STEP = 0.5  # pixels to either side for slopes: maps are smooth over the width of a star
-
-
-class Place(NamedTuple):
-    """Where places of the reference plane lie on an image.
-
-    Attributes
-    ----------
-    pixel : ndarray, shape (n, 2)
-        NaN where the image does not reach.
-    slopes : ndarray, shape (n, 2, 2)
-        Derivatives of x and y (rows) by those of the plane.
-    """
-
-    pixel: np.ndarray
-    slopes: np.ndarray
 
 
 class Places:
@@ -36,11 +19,15 @@ class Places:
     def __init__(self, view):
         self.view = view
 
-    def place(self, xy):
-        """The `Place` of positions (n, 2) of the reference plane."""
+    def pixels(self, xy):
+        """Where positions (n, 2) of the reference plane lie on the image, (n, 2); NaN where it does not reach."""
+        return self.view.distort(xy)
+
+    def slopes(self, xy):
+        """Derivatives of the pixels x and y (rows) of positions (n, 2) by those of the plane, (n, 2, 2)."""
         axes = _STEP * np.eye(2)
         columns = [(self.view.distort(xy + step) - self.view.distort(xy - step)) / (2 * _STEP) for step in axes]
-        return Place(self.view.distort(xy), np.stack(columns, axis=-1))
+        return np.stack(columns, axis=-1)
 
     def supported(self, shape, margin):
         """Pixels of the image (ny, nx) within the stars that determined the map, or so many pixels beyond them.

@@ -10,7 +10,7 @@ from ..measurement.crowding import crowding
 from ..measurement.flags import Flag
 from ..results.new_positions import add_sky
 from .agreement import BEYOND, displacements
-from .measuring import covariances, map_covariances, sharpness, star_flags
+from .measuring import covariances, map_covariances, star_flags
 
 SAME = 0.5  # FWHM from a star of the solution: it is that star
 _MAGNITUDE = 2.5 / np.log(10)
@@ -37,7 +37,7 @@ def stars_table(field, measured, solution, threshold, zero_point):
     table["flux_scatter"], table["n"] = flux_scatter(field, measured), measured.seen.sum(axis=0)
     trusted = np.array([layer.trusted for layer in field.layers])
     table["n_left_out"] = (measured.seen & ~trusted).sum(axis=0)
-    table["snr"], table["chi2_dof"], table["sharpness"] = field.snr(), chi2, sharpness(field)
+    table["snr"], table["chi2_dof"], table["sharpness"] = field.snr(), chi2, field.sharpness()[0]
     away = displacements(names, field.xy, np.einsum("naa->na", both), solution)
     displaced = away > BEYOND
     table["flags"] = star_flags(field, measured) | np.where(displaced, Flag.DISPLACED, 0)

@@ -24,7 +24,7 @@ def start(field, xy, left_out):
     light, norm = np.zeros((2, len(field.layers), len(xy)))
     for k, layer in enumerate(field.layers):
         signal, weight = layer.scene.likelihood()
-        pixel = np.nan_to_num(layer.local(xy)[0].pixel, nan=-9.0)[:, ::-1].T
+        pixel = np.nan_to_num(layer.local(xy)[0], nan=-9.0)[:, ::-1].T
         signal, weight = (map_coordinates(each, pixel, order=1, output=float) for each in (signal, weight))
         seen = weight > 0
         light[k, seen], norm[k, seen] = signal[seen] / weight[seen], weight[seen]

@@ -8,8 +8,20 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable, Table, vstack
-from deep_frames import SIGMA, artificial_inside, compared, deep_frames, excess, light
+from deep_frames import (
+    SIGMA,
+    SKY,
+    artificial_inside,
+    compared,
+    deep_frames,
+    excess,
+    flux_level,
+    light,
+    with_galaxies,
+    with_hits,
+)
 from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
 
 import legdistort as ld
 from legdistort.cli import main
@@ -17,6 +29,7 @@ from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.exposures import Exposure
 from legdistort.measurement.detection import Frame
 from legdistort.measurement.flags import Flag
+from legdistort.measurement.injection import distant
 from legdistort.measurement.scene.joint_fit import Scene
 from legdistort.measurement.scene.normal_equations import neighbour_covariance
 from legdistort.photometry.agreement import catalogue_check
@@ -71,6 +84,7 @@ def test_stars_that_no_frame_shows_are_found(truth, solution, found):
     assert over_bound < 1.3
     assert 0.75 < pull < 1.35
     assert found.stars.meta["noise_peaks"] < 0.1
+    assert not np.any(found.stars["flags"] & Flag.EXTENDED)
 
 
 def test_fluxes_of_single_exposures_scatter_as_stated(truth, solution, found):
@@ -257,6 +271,55 @@ def test_a_hit_on_a_faint_star_is_left_out(truth, solution, found):
         images = again.photometry[again.photometry["star"] == one["star"]]
         assert set(images["exposure"][(images["flags"] & Flag.DEFECT) > 0]) == {"f04"}
     assert row(again.stars, variable)["flags"] & Flag.VARIABLE
+
+
+def rows_of(truth, solution, found, *, above=3.0):
+    """Rows that lie within a FWHM of a true star of some signal-to-noise ratio of all frames, in the first frame."""
+    xy = solution["f00"].distort(np.column_stack([found.stars["x"].value, found.stars["y"].value]))
+    return cKDTree(truth.pixels[0][truth.snr > above]).query(xy)[0] < 2.3548 * SIGMA
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_where_few_exposures_see_them_pixels_tell_stars_from_hits(truth, solution, n):
+    """Tracks of particles through one exposure or two: other exposures cannot tell."""
+    rng = np.random.default_rng(9)
+    hit = replace(truth, frames=[with_hits(rng, frame.astype(float), 0.003) for frame in truth.frames[:n]])
+    clean, other = (ld.catalogue(exposures_of(each)[:n], solution) for each in (truth, hit))
+    ours, theirs = (rows_of(truth, solution, each) for each in (clean, other))
+    assert np.count_nonzero(~theirs) <= 1
+    assert other.stars.meta["n_rejected"] >= 3
+    assert np.count_nonzero(theirs) >= 0.95 * np.count_nonzero(ours)
+
+
+@pytest.mark.slow
+def test_a_galaxy_is_one_row(truth, solution, found):
+    """Exponential discs that would be taken apart into four to eight stars; the stars stay what they are."""
+    start = np.full_like(truth.xy, np.nan)
+    inside = ((truth.pixels[0] > 0) & (truth.pixels[0] < 319)).all(axis=1)
+    start[inside] = solution["f00"].correct(truth.pixels[0][inside])
+    rng = np.random.default_rng(4)
+    places = rng.uniform(50, 270, (4000, 2))
+    places = places[cKDTree(truth.xy[truth.snr > 4]).query(places)[0] > 11]
+    places = places[distant(places, 60, 4)]
+    assert len(places) == 4
+    radius = np.array([1.2, 2.2, 3.5, 2.2])
+    frames = with_galaxies(truth, places, [100, 100, 100, 50], radius)
+    other = ld.catalogue(exposures_of(replace(truth, frames=frames)), solution)
+    c = compared(truth, other.stars, start)
+    xy = np.column_stack([other.stars["x"].value, other.stars["y"].value]) - c.shift
+    extended = (other.stars["flags"] & Flag.EXTENDED) > 0
+    level = flux_level(truth, c, other.stars) * SKY * np.sqrt(4 * np.pi) * SIGMA
+    for place, r, s in zip(places, radius, [100, 100, 100, 50], strict=True):
+        near = np.hypot(*(xy - place).T) < 3 * np.hypot(2, r)
+        assert np.count_nonzero(near & extended) == 1
+        assert np.count_nonzero(near) <= 2
+        row = other.stars[near & extended]
+        assert 0.75 < row["flux"][0] / (s * level) < 1.1
+        assert np.hypot(*(xy[near & extended] - place)[0]) < 0.8
+        assert row["chi2_dof"][0] < 1.5
+    assert np.count_nonzero(extended) == 4
+    assert abs(len(other.stars) - 4 - len(found.stars)) <= 2
+    assert c.found(7) >= 0.97
 
 
 @pytest.mark.parametrize("k", [1, 3])

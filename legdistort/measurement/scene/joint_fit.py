@@ -9,6 +9,7 @@ from ..filters import gaussian_sums
 from ..profiles.pixel_noise import LEAST_SKY
 from ..sky.smooth_light import binned, spread
 from . import stamps
+from .extended import spread_light
 from .normal_equations import JointFit, assembled, normal_blocks, normal_matrix, solved
 
 _KIND = np.float32  # of the light of stars: photons bound the ratio of signal to noise of a pixel
@@ -42,6 +43,8 @@ class Scene(JointFit):
     ----------
     xy, flux : ndarray, shape (n, 2), (n,)
         Of the stars; positions [pix] count from the middle of the PSF.
+    spread : ndarray, shape (n, 2, 2)
+        Of sources wider than stars, as of `legdistort.measurement.scene.extended.spread_light`; 0 for stars.
     sky : ndarray, shape (ny, nx)
         Smooth light beside that of the stars, and that which was taken off before.
     light : ndarray, shape (ny, nx)
@@ -57,7 +60,7 @@ class Scene(JointFit):
         self.good = frame.good & ~frame.saturated
         if frame.defects is not None:
             self.good &= ~frame.defects
-        self.xy, self.flux = np.zeros((0, 2)), np.zeros(0)
+        self.xy, self.flux, self.spread = np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2))
         self.sky, self.light, self.weights = (np.zeros(frame.signal.shape, dtype=_KIND) for _ in range(3))
         self.noise = float(np.sqrt(np.median(frame.variance[::8, ::8])))
         self.use(psf)
@@ -211,20 +214,23 @@ class Scene(JointFit):
         """More stars."""
         rows = np.arange(len(self.flux), len(self.flux) + len(flux))
         self.xy, self.flux = np.vstack([self.xy, xy]), np.append(self.flux, flux)
+        self.spread = np.concatenate([self.spread, np.zeros((len(flux), 2, 2))])
         self._add(rows, 1)
 
     def remove(self, rows):
         """Stars taken off; a mask (n,)."""
         self._add(np.flatnonzero(rows), -1)
-        self.xy, self.flux = self.xy[~rows], self.flux[~rows]
+        self.xy, self.flux, self.spread = self.xy[~rows], self.flux[~rows], self.spread[~rows]
 
-    def set(self, rows, xy, flux):
-        """Other positions and fluxes of some stars."""
+    def set(self, rows, xy, flux, spread=None):
+        """Other positions and fluxes of some stars, perhaps another spread."""
         if len(rows) == len(self.flux):  # half the work
             self.light[:] = 0
         else:
             self._add(rows, -1)
         self.xy[rows], self.flux[rows] = xy, flux
+        if spread is not None:
+            self.spread[rows] = spread
         self._add(rows, 1)
 
     def stars(self, rows):
@@ -232,16 +238,27 @@ class Scene(JointFit):
         centres = np.round(self.xy[rows]).astype(int)
         return np.column_stack([self.xy[rows] - centres, self.flux[rows]]), centres
 
+    def star_light(self, rows, params, centres, half, *, slopes=False):
+        """Light of some `stars` on stamps, and with `slopes` its derivatives by x, y and flux, (m, 3, npix)."""
+        out, wide = self.psf.light(params, centres, half, slopes=slopes), self.spread[rows].any(axis=(1, 2))
+        if wide.any():
+            own = spread_light(self.psf, params[wide], self.spread[rows][wide], centres[wide], half, slopes=slopes)
+            for plane, values in zip(out, own, strict=False) if slopes else ((out, own),):
+                plane[wide] = values
+        return out
+
     def _add(self, rows, sign, image=None):
         """The light of some stars added to that of all, or to an image, as far as it is seen."""
         if image is None and len(rows):
             image, self._snr = self.light, None
         reach = (self.flux[rows, None] > self._faint).sum(axis=1)
+        reach = np.maximum(reach, self.spread[rows].any(axis=(1, 2)))
         for k, width in enumerate((1, 2, 4)):
             some = rows[reach == k]
             for i in range(0, len(some), _CHUNK):
-                params, centres = self.stars(some[i : i + _CHUNK])
-                light = self.psf.light(params.astype(_KIND), centres, width * self.half)
+                own = some[i : i + _CHUNK]
+                params, centres = self.stars(own)
+                light = self.star_light(own, params.astype(_KIND), centres, width * self.half)
                 stamps.lay(image, light, centres, width * self.half, sign)
 
     def equations(self, rows):
@@ -287,9 +304,9 @@ class Scene(JointFit):
         for i in range(0, len(rows), _CHUNK):
             part = slice(i, i + _CHUNK)
             if flux_alone:
-                out[part, 0] = self.psf.light(params[part], centres[part], self.half)
+                out[part, 0] = self.star_light(rows[part], params[part], centres[part], self.half)
             else:
-                out[part] = self.psf.light(params[part], centres[part], self.half, slopes=True)[1]
+                out[part] = self.star_light(rows[part], params[part], centres[part], self.half, slopes=True)[1]
             right[part] = stamps.weigh(out[part], centres[part], self.half, self.weights, left)
         return out, right, centres
 
@@ -368,6 +385,18 @@ class Scene(JointFit):
         chi2, levers = self._over_stars(rows, lambda *stars: stamps.cores(*stars, self.half, radius, planes), 2).T
         return (chi2, levers) if lever else chi2
 
+    def middles(self, rows=None):
+        """Products of the light of stars, or some, in their central pixels with what is left there, and with itself.
+
+        In units of the noise, (2, n); 0 where that is no good pixel.
+        """
+        rows = np.arange(len(self.flux)) if rows is None else rows
+        params, centres = self.stars(rows)
+        own = self.star_light(rows, params, centres, 0)[:, 0]
+        pixels, inside = stamps.stamp_pixels(centres, 0, self.light.shape)
+        weights = np.where(inside, self.weights.ravel()[pixels], 0)[:, 0]
+        return np.array([weights * own * self.residual_at(pixels)[:, 0], weights * own**2])
+
     def chi2_around(self, places):
         """Sum of the squared residuals in units of the noise within a core of some places; (n,)."""
         centres = np.round(places).astype(int)
@@ -380,8 +409,9 @@ class Scene(JointFit):
         rows = np.arange(len(self.flux)) if rows is None else rows
         out = np.zeros((len(rows), *shape))
         for i in range(0, len(out), _CHUNK):
-            params, centres = self.stars(rows[i : i + _CHUNK])
-            own = self.psf.light(params.astype(_KIND), centres, self.half)
+            some = rows[i : i + _CHUNK]
+            params, centres = self.stars(some)
+            own = self.star_light(some, params.astype(_KIND), centres, self.half)
             out[i : i + _CHUNK] = function(own, params, centres)
         return out
 

@@ -51,6 +51,7 @@ def _bright(scene):
     """Bright stars that others disturb little; the brightest first."""
     snr, light = scene.snr(), scene.light.ravel()
     order = np.argsort(-snr, kind="stable")
+    order = order[~scene.spread[order].any(axis=(1, 2))]
     rows = order[snr[order] > _BRIGHT][: 4 * _MOST]
     params, centres, pixels, inside = scene.on_stamps(rows)
     near = scene.near(params) & inside
