@@ -14,7 +14,6 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
-from astropy.table import Table
 from PIL import Image
 
 import legdistort as ld
@@ -24,7 +23,6 @@ from legdistort.demo import run_demo
 from legdistort.plots import solution_plots, stack_plots
 from legdistort.plots.residual_plots import plot_steps
 from legdistort.results import accuracy
-from legdistort.simulation.pupil import PupilPSF
 from legdistort.solving import minimisers, start_values
 from legdistort.solving.equations.problem import build_problem
 
@@ -37,9 +35,6 @@ def main():
     IMAGES.mkdir(exist_ok=True)
     save(sweeps(), "sweeps.png")
     save(planned(), "planning.png", colours=256)
-    plan = planned_with_micado()
-    save(plan.plot_errors().figure, "planning_errors.png", colours=256)
-    save(plan.plot().figure, "planning_correction.png", colours=256)
     save(ld.Camera.gsaoi().plot().figure, "gsaoi_camera.png")
     with tempfile.TemporaryDirectory() as folder:
         night = run_demo(out=Path(folder) / "night")
@@ -121,15 +116,6 @@ def draw_first_mosaic(run):
 def noise(frame):
     """Errors of positions against flux for four widths, by stars put into a frame of the night."""
     return ld.calibrate_noise(ld.read_exposures(frame), fwhm=[3.5, 4.5, 5.5, 6.5]).plot().figure
-
-
-def planned_with_micado():
-    """The example of docs/planning.md."""
-    psf = PupilPSF.of_telescope(wavelength=2.145e-6, diameter=38.5, pixel_scale=0.004, seeing=0.6, strehl=0.4)
-    micado = ld.Instrument.named("MICADO", filter="Ks", psf=psf, exposure_time=60, error_floor=0.01)
-    mag = np.arange(15.0, 25.0)
-    stars = Table({"mag": mag, "density": 30 * 10 ** (0.25 * (mag - 18))})
-    return ld.predict(n_exposures=20, instrument=micado, stars=stars, dithers=500, degree=3, dynamic=0.5)
 
 
 def planned():

@@ -1,4 +1,4 @@
-"""Table of docs/stack_quality.md: ``python tests/benchmarks/coadd_table.py [--small] [--only WORDS] [--rounds N]``.
+"""Table of stacks in README.md: ``python tests/benchmarks/coadd_table.py [--small] [--only WORDS] [--rounds N]``.
 
 A simulated GSAOI night (eleven frames of 2048 x 2048 px) is measured and solved; then legdistort, reproject, SWarp and
 drizzle co-add the same frames with the same distortions on the same grid, each in a process of its own, one after the

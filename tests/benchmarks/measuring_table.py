@@ -1,4 +1,4 @@
-"""Figures of docs/measuring.md: ``python tests/benchmarks/measuring_table.py [PART ...] [--frames N]``.
+"""Figures of measuring: ``python tests/benchmarks/measuring_table.py [PART ...] [--frames N]``.
 
 ``rivals``: rms error of positions over the Cramer-Rao bound, beside SExtractor (windowed positions, if the command
 ``source-extractor`` is there) and photutils; ``widths``: the same for legdistort at seven widths; ``profile``: what a

@@ -19,7 +19,9 @@ import legdistort
 from legdistort.cli import parser
 
 ROOT = Path(__file__).parents[2]
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.md"))
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs").glob("paper/*.md"))]
+PAGES += NOTEBOOKS
 
 
 #: Those that install and run everything.
@@ -31,16 +33,22 @@ def blocks(page, language):
     return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
-#: A fenced block of code: why it cannot run here, if it cannot, its language and its text.
-BLOCK = re.compile(r"^(?:<!-- not run: ([^\n]*) -->\n)?```(sh|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+#: A fenced block of code: why it cannot run here, if it cannot, its language and its text. Cells of notebooks are such
+#: blocks, but for those that only choose the picture of the gallery.
+BLOCK = re.compile(
+    r"^(?:<!-- not run: ([^\n]*) -->\n)?```(sh|python|\{code-cell\} ipython3)\n(?!:tags: \[remove-cell\])(.*?)^```$",
+    re.MULTILINE | re.DOTALL,
+)
 
 
 def reading_order():
-    """The README, and the pages in the order of its links; a page whose code needs that of another comes after it."""
+    """The README, and the pages in the order of its links; a page whose code needs that of another comes after it.
+    Notebooks come last.
+    """
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     linked = dict.fromkeys(re.findall(r"\]\((docs/[\w/]+\.md)\)", readme))
     tutorial = "docs/first_mosaic.md"
-    return [ROOT / "README.md", ROOT / tutorial, *(ROOT / page for page in linked if page != tutorial)]
+    return [ROOT / "README.md", ROOT / tutorial, *(ROOT / page for page in linked if page != tutorial), *NOTEBOOKS]
 
 
 def test_the_readme_leads_to_every_page_with_code():
@@ -60,7 +68,35 @@ LEAVING = {ROOT / "docs" / "first_mosaic.md": "tutorial"}
 
 def running(page):
     """Language and text of the blocks of a page that run."""
-    return [(language, code) for why, language, code in BLOCK.findall(page.read_text(encoding="utf-8")) if not why]
+    found = [(language, code) for why, language, code in BLOCK.findall(page.read_text(encoding="utf-8")) if not why]
+    return [("python", in_python(code)) if "code-cell" in language else (language, code) for language, code in found]
+
+
+def in_python(cell):
+    """A cell without its options, in which ``!legdistort ...`` calls what `SESSION` has."""
+    return re.sub(r"^!(legdistort .*)$", lambda line: f"_run({line[1]!r})", re.sub(r"\A(:.*\n)+", "", cell), flags=re.M)
+
+
+def test_the_gallery_shows_every_notebook():
+    gallery = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    assert len(NOTEBOOKS) >= 6
+    for page in NOTEBOOKS:
+        text = page.read_text(encoding="utf-8")
+        (title,) = re.findall("^# (.*)$", text, re.MULTILINE)
+        assert f"{{glue}}`notebooks/{page.name}::picture`" in gallery
+        assert f"[{title}](notebooks/{page.name})" in gallery
+        assert f"\nnotebooks/{page.stem}\n" in gallery
+        assert '"name": "picture"' in text
+        assert f"<{page.stem}.ipynb>" in text
+
+
+def test_cells_run_as_in_a_notebook():
+    assert (
+        in_python(":tags: [hide-output]\n\n!legdistort demo --out a\nx = 1\n")
+        == "\n_run('legdistort demo --out a')\nx = 1\n"
+    )
+    assert any("_run('legdistort demo" in code for page in NOTEBOOKS for _, code in running(page))
+    assert not any("scrapbook" in code for page in NOTEBOOKS for _, code in running(page))
 
 
 def needed(page):
@@ -96,7 +132,7 @@ def run(line):
     words = subprocess.check_output(["bash", "-euc", "printf '%s\\\\0' " + line], text=True).split("\\0")
     assert main(words[1:-1]) == 0, line
 
-names = {}
+names = {"_run": run}
 """
 
 
