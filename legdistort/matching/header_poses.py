@@ -9,6 +9,7 @@ from astropy.coordinates import SkyCoord
 from scipy import special
 from scipy.sparse.csgraph import connected_components
 
+from ..cameras.focal_planes import FocalPlane, agreed_similarity
 from ..exceptions import AssumptionWarning, warn
 from ..geometry import similarity
 from ..geometry.tangent_plane import TangentPlane
@@ -18,6 +19,8 @@ from ..results.errors.header_pointing import HeaderPointing
 
 #: Headers that disagree with the others by more than this part of the field do not determine where the field lies.
 TOLERANCE = 0.1
+#: Nor do those in which the pixels are by more than this, and so many times the scatter of all, of another size.
+_SCALE_OFF, _MANY = 3e-3, 6.0
 #: The dithers by headers and by stars are compared in so many exposures or more; they contradict each other if a turn
 #: and a scale explain what they differ by, by no more than this chance, and that is more than this part of the dithers.
 _FEWEST, _BY_CHANCE, _DEPARTURE = 4, 1e-4, 0.05
@@ -40,12 +43,19 @@ class HeaderPoses:
     starts : dict
         ``{exposure: (2, 3)}``, plane -> pixels, as `legdistort.match` is given them; and by `XSHIFT`, `YSHIFT`, of
         exposures that state these and have no WCS.
+    odd : dict
+        ``{detector: pixels}`` of a camera by which WCSs contradict those of others; "DETECTOR of EXPOSURE" of some
+        exposures alone.
+    apart : float
+        Error of where the plane lies [pix, per axis], where WCSs of detectors contradict one another.
     """
 
     poses: dict
     shapes: dict
     sky: TangentPlane | None
     starts: dict = field(default_factory=dict)
+    odd: dict = field(default_factory=dict)
+    apart: float = 0.0
 
     @classmethod
     def of(cls, exposures, shapes, start=None):
@@ -64,7 +74,8 @@ class HeaderPoses:
             name: np.column_stack([np.eye(2), each]) for name, each in stated.items() if all(map(_is_number, each))
         }
         starts |= {name: _turned(shapes[name], *each) for name, each in (start or {}).items()}
-        return replace(cls.from_wcs({e.name: e.wcs for e in exposures if e.wcs is not None}, shapes), starts=starts)
+        found = cls.from_wcs({e.name: e.wcs for e in exposures if e.wcs is not None}, shapes)
+        return replace(found, starts=starts, **_contradicting(exposures))
 
     @classmethod
     def from_wcs(cls, wcss, shapes):
@@ -119,6 +130,8 @@ class HeaderPoses:
         """
         agreement = self._agreement(found)
         if agreement is None:
+            if self.odd:
+                warn(self.pointing(found).sentence, AssumptionWarning)
             return found, None
         names, steps, _, good = agreement
         if words := self.pointing(found).sentence:
@@ -133,7 +146,7 @@ class HeaderPoses:
         """The `HeaderPointing` of poses ``{exposure: (2, 3)}`` in any plane; None without headers."""
         agreement = self._agreement(found)
         if agreement is None:
-            return None
+            return HeaderPointing(0, np.nan, np.nan, detectors=self.odd) if self.odd else None
         names, steps, corners, good = agreement
         n = np.count_nonzero(good)
         if 2 * n <= len(names):
@@ -141,12 +154,15 @@ class HeaderPoses:
         middles, turns = corners.mean(axis=1), np.array([similarity.describe(step)["rotation"] for step in steps])
         turns = (turns - turns[good][0] + 180) % 360 - 180
         turns = (turns - turns[good].mean() + 180) % 360 - 180
-        errors = [np.nan, np.nan]
+        errors, each = [np.nan] * 3, (middles, turns[:, None], _log_scales(steps)[:, None])
         if n > 1:
-            errors = [np.sqrt(np.mean(np.var(each[good], axis=0, ddof=1)) / n) for each in (middles, turns[:, None])]
+            errors = [np.sqrt(np.mean(np.var(values[good], axis=0, ddof=1)) / n) for values in each]
+        shift, turn, scale = map(float, errors)
+        if self.apart > 0:
+            shift = float(np.hypot(np.nan_to_num(shift), self.apart))
         apart = np.linalg.norm(corners - np.median(corners, axis=0), axis=2).max(axis=1)
         off = {names[k]: (float(apart[k]), float(turns[k])) for k in np.flatnonzero(~good)}
-        return HeaderPointing(int(n), *map(float, errors), off)
+        return HeaderPointing(int(n), shift, turn, off, scale=scale, detectors=self.odd, apart=self.apart)
 
     def _size(self, names):
         return max(max(self.shapes[n]) for n in names)
@@ -162,7 +178,11 @@ class HeaderPoses:
         steps = np.array([similarity.compose(similarity.invert(found[n]), self.poses[n]) for n in names])
         corners = np.array([similarity.apply(step, _grid(self.shapes[names[0]], 2)) for step in steps])
         apart = np.linalg.norm(corners - np.median(corners, axis=0), axis=2).max(axis=1)
-        return names, steps, corners, apart < TOLERANCE * self._size(names)
+        good, logs = apart < TOLERANCE * self._size(names), _log_scales(steps)
+        if np.count_nonzero(good) > 2:
+            off = np.abs(logs - np.median(logs[good]))
+            good &= off < max(_SCALE_OFF, _MANY * 1.4826 * np.median(off[good]))
+        return names, steps, corners, good
 
     def _compare_dithers(self, found, mean):
         """Warn where the stars move between exposures as no WCS of that scale and orientation lets them move.
@@ -198,6 +218,28 @@ class HeaderPoses:
                 "the headers",
                 AssumptionWarning,
             )
+
+
+def _log_scales(steps):
+    """Logarithms (n,) of the scales of similarities (n, 2, 3)."""
+    return np.log(np.abs(np.linalg.det(steps[:, :, :2]))) / 2
+
+
+def _contradicting(exposures):
+    """What headers of detectors contradict in each other, ``odd`` and ``apart`` of `HeaderPoses`."""
+    planes = [each for each in exposures if isinstance(each, FocalPlane) and (each.wcs is not None or each.odd)]
+    far = {}
+    for plane in planes:
+        for detector, pixels in plane.odd.items():
+            far.setdefault(detector, {})[plane.name] = pixels
+    odd = {}
+    for detector, each in far.items():
+        if len(each) == len(planes):
+            odd[detector] = max(each.values())
+        else:
+            odd |= {f"{detector} of {name}": pixels for name, pixels in each.items() if np.isfinite(pixels)}
+    apart = [plane.apart for plane in planes if np.isfinite(plane.apart)]
+    return {"odd": odd, "apart": float(np.median(apart)) if apart else 0.0}
 
 
 def _groups(names, corners, tolerance):
@@ -240,9 +282,33 @@ def sky_by_layout(matches, found, poses):
     before = matches.camera.headers
     if before is None or found is None or matches.camera.states_scale:
         return matches.sky
-    back = similarity.compose(before.similarity, similarity.invert(found.similarity))
+    back = similarity.compose(similarity_of(before)[0], similarity.invert(similarity_of(found)[0]))
     moves = [similarity.compose(similarity.invert(pose), similarity.compose(back, pose)) for pose in poses]
     return replace(matches.sky, matrix=similarity.compose(matches.sky.matrix, np.mean(moves, axis=0)))
+
+
+def similarity_of(layout):
+    """From the plane of headers to the focal plane (2, 3), and the error of its place [pix] where headers disagree.
+
+    Where these show which of them are right, that of the layout, else what agrees of them.
+
+    Parameters
+    ----------
+    layout : `~legdistort.cameras.header_layout.HeaderLayout`
+    """
+    if layout.is_undecided:
+        agreed = agreed_similarity(layout.found, layout.stated)
+        if agreed.pose is not None:
+            return similarity.invert(agreed.pose), agreed.apart
+    return layout.similarity, 0.0
+
+
+def pointing_by_layout(pointing, found):
+    """A `HeaderPointing` with what headers disagree by of a found layout, if nothing shows which of them are wrong."""
+    apart = 0.0 if found is None or pointing is None else similarity_of(found)[1]
+    if not apart > 0 or pointing.apart > 0 or pointing.detectors:
+        return pointing
+    return replace(pointing, apart=apart, shift=float(np.hypot(np.nan_to_num(pointing.shift), apart)))
 
 
 def header_map_by(matches, poses, sky, variances):

@@ -60,7 +60,8 @@ def _pointing(solution):
     return {
         "n_used": found.n_used,
         "least_err_mas": _plain(1000 * scale * found.shift), "least_rotation_err_deg": _plain(found.turn),
-        "contradicting": off, "groups": [list(group) for group in found.groups],
+        "least_scale_err": _plain(found.scale), "contradicting": off, "groups": [list(group) for group in found.groups],
+        "contradicting_detectors": [{"name": name, "off_px": _plain(off)} for name, off in found.detectors.items()],
     }  # fmt: skip
 
 

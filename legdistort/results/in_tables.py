@@ -229,8 +229,10 @@ def sky_sentence(solution):
         return "not known: no WCS in the headers that proved right, no reference catalogue with ra, dec"
     source = {"exposures": "from the headers", "reference": "from the reference"}.get(solution.diagnostics.sky, "")
     tied = ", tied to the reference" if source and solution.gauge.tie is not None and "head" in source else ""
-    if "head" in source and not tied and solution.camera.headers is not None and (odd := solution.camera.headers.odd):
-        source += f" of all detectors but {', '.join(odd)}"
+    odd = () if solution.camera.headers is None else solution.camera.headers.odd
+    odd = odd or (() if solution.diagnostics.pointing is None else tuple(solution.diagnostics.pointing.detectors))
+    if "head" in source and not tied and odd:
+        source += f" of all detectors but {some_of(odd, 6)}"
     pointing = None if solution.gauge.poses_known else solution.diagnostics.pointing
     if source == "from the headers" and not tied and pointing is not None and pointing.off:
         source += f" of {pointing.n_used} of {pointing.n_used + len(pointing.off)} exposures"

@@ -16,7 +16,7 @@ from ..cameras.exchanged import check_places
 from ..cameras.stated_errors import undetermined_degree, with_errors_times
 from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, SolveError, warn
 from ..geometry import basis
-from ..matching.header_poses import header_map_by, sky_by_layout
+from ..matching.header_poses import header_map_by, pointing_by_layout, sky_by_layout
 from ..matching.matches import Matches
 from ..priors.prior import Prior, has_distortion
 from ..results.diagnostics import Diagnostics
@@ -282,8 +282,8 @@ def solve(
         diagnostics = _diagnostics(given, fit, prior, scale, pointing=given.pointing, terms=found(scale), **chosen)
         fit = _placed(fit, sought, given, whole) if tie is None else tie(fit, scale=scale)
     epoch = fit.matches.epoch if epoch is None else epoch
-    sky = _source_of_sky(given, fit, tie)
-    found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue), epoch=epoch)
+    sky = {"sky": _source_of_sky(given, fit, tie), "pointing": fit.matches.pointing}
+    found = replace(diagnostics, **sky, reference=reference_tie.used_reference(fit, catalogue), epoch=epoch)
     solution = _with_camera(_solution(fit, scale, _settings(asked, options, form), found, form), given)
     if words := warning_of(solution):
         log.warning("%s", words)
@@ -483,7 +483,8 @@ def _placed(fit, sought, matches, whole):
         headers = headers_of_parts(whole, dict(zip(fit.problem.names, poses, strict=True)))
         poses = np.array(list(whole.poses.values()))
     sky = sky_by_layout(whole if apart else matches, headers, poses)
-    return replace(fit, matches=replace(fit.matches, sky=sky))
+    pointing = pointing_by_layout(fit.matches.pointing, headers)
+    return replace(fit, matches=replace(fit.matches, sky=sky, pointing=pointing))
 
 
 def _plain(options):

@@ -1,6 +1,7 @@
 """Matching: synthetic fields of known truth, headers that lie, frames that do not belong, two real sets."""
 
 import inspect
+import warnings
 from dataclasses import fields
 
 import numpy as np
@@ -58,7 +59,9 @@ SAMPLE = [
 def assert_field(cell, *, seed, flips=None, headers=False):
     table = grid_field(cell, seed=seed, flips=flips)
     where = {"exposures": grid_exposures(cell, seed=seed, flips=flips)} if headers else {"shape": SHAPE}
-    assert_good(table, match(table, **where))
+    with warnings.catch_warnings():  # scales of these exposures differ by per cents, of which headers know nothing
+        warnings.filterwarnings("ignore", ".*the header WCSs contradict the stars in their scale", AssumptionWarning)
+        assert_good(table, match(table, **where))
 
 
 @pytest.mark.parametrize(("cell", "flips", "headers"), SAMPLE, ids=str)

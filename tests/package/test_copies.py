@@ -85,7 +85,7 @@ def matches():
         table, camera=pair, start=start, poses=sim.matches.poses, sky=sky, left_out={"bad": "no stars: 'none'"},
         epoch=2020.25,
         header_distortion="SIP, up to 4.48 px over the detector", pose_sigma={"shift": 20.0, "scale": 0.1},
-        pointing=HeaderPointing(2, 0.5, 0.1, {"e0": (30.0, 180.0)}, (("e0", "e1"), ("e2",))),
+        pointing=HeaderPointing(2, 0.5, 0.1, {"e0": (30.0, 180.0)}, (("e0", "e1"), ("e2",)), 0.01, {"2": 40.0}, 3.0),
     )  # fmt: skip
 
 

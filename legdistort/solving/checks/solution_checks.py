@@ -477,8 +477,10 @@ def pointing_check(solution):
     pointing = solution.diagnostics.pointing
     if pointing is None or not (words := pointing.sentence):
         return None
-    n = len(pointing.off) + sum(map(len, pointing.groups))
-    return Check("header pointing", "warn", float(n), 0.0, words, POINTING_CURE)
+    n = len(pointing.off) + sum(map(len, pointing.groups)) + len(pointing.detectors)
+    by_headers = solution.sky is not None and solution.diagnostics.sky == "exposures" and solution.gauge.tie is None
+    state = "fail" if pointing.is_undecided and by_headers else "warn"
+    return Check("header pointing", state, float(n), 0.0, words, POINTING_CURE)
 
 
 def header_check(header_distortion):
