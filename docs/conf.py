@@ -50,6 +50,7 @@ nb_execution_in_temp = True
 nb_execution_raise_on_error = True
 nb_execution_timeout = 600  # seconds a cell, on a busy machine
 nb_merge_streams = True
+os.environ.pop("MPLBACKEND", None)  # a kernel then has that which shows figures
 os.environ["PYTHONWARNINGS"] = "ignore:IProgress not found"  # of tqdm without widgets; there are none in pages
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 
