@@ -159,7 +159,7 @@ class Mosaic(ShownAsPrinted):
         stars : array_like, shape (n, 2), optional
             Positions to be circled, pixels of the mosaic.
         ax : `~matplotlib.axes.Axes`, optional
-            Where to draw.
+            Where to draw; WCSAxes too (``projection=mosaic.wcs``, or that of another image).
 
         Returns
         -------
@@ -168,7 +168,7 @@ class Mosaic(ShownAsPrinted):
         Raises
         ------
         InputError
-            If no pixel has data.
+            If no pixel has data, or WCSAxes and mosaic have no sky in common.
         """
         return plot_mosaic(self, stars=stars, ax=ax)
 

@@ -1,15 +1,18 @@
 """Pieces that pictures are made of: axes, titles, ticks, grids, round numbers, block means."""
 
+from copy import deepcopy
 from functools import cache
 
 import numpy as np
 
+from ..exceptions import InputError
 from ..geometry import basis
 
 #: Colours that stay apart for colour-blind readers and in grey print (Okabe & Ito).
 BLUE, ORANGE, RED, GREEN, GREY = "#0072B2", "#E69F00", "#D55E00", "#009E73", "#9a9a9a"
 
 _GRID_LINES = 11
+_SAME = 1e-4  # pixels by which places may differ on an image that has the WCS of the axes
 
 
 def round_down(value):
@@ -77,6 +80,72 @@ def mark(artist, *, stars=None, exposures=None):
     artist.set_gid(":".join(["marks", *keys]))
 
 
+def on_sky(ax):
+    """Whether axes are WCSAxes of astropy, whose coordinates are pixels of their own WCS."""
+    return hasattr(ax, "get_coords_overlay")
+
+
+def to_axes(ax, xy, wcs):
+    """Pixels (..., 2) of an image in the coordinates of axes: of WCSAxes by the sky, if need be, of others as they are.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+    xy : array_like, shape (..., 2)
+    wcs : callable or None
+        Returns the WCS of the image. None: pixels of the image are those of the axes.
+
+    Raises
+    ------
+    InputError
+        If WCSAxes and image have no sky in common, or the image is not on theirs.
+    """
+    xy = np.asarray(xy, dtype=float)
+    if wcs is None or not on_sky(ax):
+        return xy
+    from astropy.wcs import NoConvergence
+    from astropy.wcs.utils import pixel_to_pixel
+
+    own = _unbounded(wcs())
+    try:
+        there = np.stack(pixel_to_pixel(own, _unbounded(ax.wcs), xy[..., 0], xy[..., 1]), axis=-1)
+    except (TypeError, ValueError, AttributeError, NoConvergence) as error:
+        raise InputError(
+            "the picture cannot be drawn on these WCSAxes: its WCS and theirs must lie on the sky, with two axes; give "
+            "axes without projection, or solve with frames whose headers have a WCS"
+        ) from error
+    if np.any(np.isfinite(xy) & ~np.isfinite(there)):
+        raise InputError("the picture lies outside of the sky that these WCSAxes project: give axes of its own field")
+    return xy if np.allclose(there, xy, rtol=0, atol=_SAME) else there  # an edge stays what a WCS is defined on
+
+
+def _unbounded(wcs):
+    """A WCS that has values outside its image, where magnified arrows end."""
+    if getattr(wcs, "bounding_box", None) is None:
+        return wcs
+    wcs = deepcopy(wcs)
+    wcs.bounding_box = None
+    return wcs
+
+
+def frame(ax, low, high, wcs):
+    """Limit axes to pixels of an image between two corners, (x, y) each, and say what they are.
+
+    WCSAxes, which say that themselves, get the limits of what holds the corners; `wcs` is that of `to_axes`.
+    """
+    corners = to_axes(ax, [low, (high[0], low[1]), high, (low[0], high[1])], wcs)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    if not on_sky(ax):
+        ax.set(xlabel="x [px]", ylabel="y [px]")
+
+
+def draw_cells(ax, x, y, values, wcs, **style):
+    """Cells in colour between edges x (n_x + 1,) and y (n_y + 1,), pixels of an image; `wcs` is that of `to_axes`."""
+    corners = to_axes(ax, np.stack(np.meshgrid(x, y), axis=-1), wcs)
+    return ax.pcolormesh(corners[..., 0], corners[..., 1], np.ma.masked_invalid(values), rasterized=True, **style)
+
+
 def draw_lines(ax, segments, **style):
     """Straight lines (n, 2, 2), with the limits of the axes following them."""
     from matplotlib.collections import LineCollection
@@ -105,7 +174,7 @@ def _grid(degree):
     return [(*at, basis.values(degree, *at)) for at in ((u, v), (v, u))]
 
 
-def draw_image(ax, image, *, sky, soft, low, high, extent):
+def draw_image(ax, image, *, sky, soft, low, high, extent, wcs=None):
     """An image in asinh stretch, dark on light; pixels without data are pale blue.
 
     Parameters
@@ -119,17 +188,19 @@ def draw_image(ax, image, *, sky, soft, low, high, extent):
         Where it ends, in stretched values.
     extent : tuple
         As matplotlib takes it.
+    wcs : callable, optional
+        That of `to_axes`, where the axes may be WCSAxes.
     """
     from matplotlib import colormaps
 
-    ax.imshow(
-        np.ma.masked_invalid(np.arcsinh((image - sky) / soft)),
-        vmin=low,
-        vmax=high,
-        cmap=colormaps["gray_r"].with_extremes(bad="#cfe0f1"),
-        origin="lower",
-        extent=extent,
-    )
+    values = np.arcsinh((image - sky) / soft)
+    style = {"vmin": low, "vmax": high, "cmap": colormaps["gray_r"].with_extremes(bad="#cfe0f1")}
+    corners = np.reshape(extent, (2, 2)).T
+    if wcs is None or np.array_equal(to_axes(ax, corners, wcs), corners):
+        ax.imshow(np.ma.masked_invalid(values), origin="lower", extent=extent, **style)
+    else:
+        edges = (np.linspace(*limits, n + 1) for limits, n in zip(corners.T, values.shape[::-1], strict=True))
+        draw_cells(ax, *edges, values, wcs, **style)
 
 
 def running_median(x, y, per_bin=8):

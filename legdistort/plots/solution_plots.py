@@ -4,6 +4,8 @@ Every function draws on the axes ``ax`` that it is given, or on new ones, and re
 several take a figure ``fig``, set its size and return a list of axes. Nothing is shown or saved.
 """
 
+from functools import partial
+
 import numpy as np
 
 from ..exceptions import InputError
@@ -34,12 +36,13 @@ def plot_residuals(view, *, scale=None, ax=None):
     scale : float, optional
         Magnification; by default a round number that makes the longest tenth of the arrows 8 % of the detector.
     ax : `~matplotlib.axes.Axes`, optional
-        Where to draw.
+        Where to draw; WCSAxes too, of the exposure or of another image of that sky, on which the arrows lie as they do
+        over the detector.
 
     Raises
     ------
     InputError
-        If none of the positions was used, or the scale is not positive.
+        If none of the positions was used, the scale is not positive, or WCSAxes and exposure have no sky in common.
     """
     if scale is not None:
         check_positive(scale, "scale")
@@ -56,9 +59,14 @@ def plot_residuals(view, *, scale=None, ax=None):
         rows = np.random.default_rng(0).choice(rows, _MAX_ARROWS, replace=False)
     if view.chip is None and view.solution.camera.has_focal_plane:
         outline_detectors(view.solution.camera, ax)
-    ax.plot(x[~used], y[~used], "x", color=elements.RED, markersize=4, label="not used", linestyle="none")
+    xy, off, wcs = np.stack([x, y], axis=1), np.stack([dx, dy], axis=1), partial(getattr, view, "wcs")
+    places = elements.to_axes(ax, xy, wcs)
+    if elements.on_sky(ax):
+        off = (elements.to_axes(ax, xy + scale * off, wcs) - places) / scale
+    ax.plot(*places[~used].T, "x", color=elements.RED, markersize=4, label="not used", linestyle="none")
     arrows = ax.quiver(
-        *(a[rows] for a in (x, y, dx, dy)),
+        *places[rows].T,
+        *off[rows].T,
         angles="xy",
         scale_units="xy",
         scale=1 / scale,
@@ -66,8 +74,10 @@ def plot_residuals(view, *, scale=None, ax=None):
         color=elements.BLUE,
     )
     key = elements.round_down(0.1 * max(nx, ny) / scale)
-    ax.quiverkey(arrows, 0.87, 1.025, key, f"{key:g} px", labelpos="E", coordinates="axes")
-    ax.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), xlabel="x [px]", ylabel="y [px]", aspect="equal")
+    middle = np.array([[0, 0], [1, 0], [0, 1]]) + (nx / 2, ny / 2)
+    pixel = np.sqrt(abs(np.linalg.det(np.diff(elements.to_axes(ax, middle, wcs), axis=0))))
+    ax.quiverkey(arrows, 0.87, 1.025, key * pixel, f"{key:g} px", labelpos="E", coordinates="axes")
+    elements.frame(ax, (-0.5, -0.5), (nx - 0.5, ny - 0.5), wcs)
     if not used.all():
         ax.legend(loc="upper right", fontsize="small")
     elements.set_title(ax, f"{elements.shorten(view.label)}: residuals × {scale:g}")
@@ -302,7 +312,7 @@ def plot_scatter(solution, *, label="scatter of one star", color=elements.BLUE, 
     return ax
 
 
-def plot_sigma_map(x, y, sigma, *, stars=None, unit="px", ax=None):
+def plot_sigma_map(x, y, sigma, *, stars=None, unit="px", wcs=None, ax=None):
     """Map of the error of a corrected position (the paper's Figure "ergrid").
 
     Drawn by ``plot_sigma_map(*view.sigma_map())``.
@@ -317,13 +327,15 @@ def plot_sigma_map(x, y, sigma, *, stars=None, unit="px", ax=None):
         Positions of the stars that were fitted, drawn as crosses.
     unit : str
         Of the errors, for the label.
+    wcs : callable, optional
+        Returns the WCS of the pixels, where the axes may be WCSAxes.
     ax : `~matplotlib.axes.Axes`, optional
         Where to draw.
 
     Raises
     ------
     InputError
-        If the shapes do not agree.
+        If the shapes do not agree, or WCSAxes and pixels have no sky in common.
     """
     from matplotlib import colormaps
 
@@ -334,20 +346,21 @@ def plot_sigma_map(x, y, sigma, *, stars=None, unit="px", ax=None):
     if sigma.ndim == 3:
         sigma = np.sqrt(np.mean(sigma**2, axis=2))
     good = sigma[np.isfinite(sigma)]
-    picture = ax.pcolormesh(
-        x,
-        y,
-        np.ma.masked_invalid(sigma),
+    edges = (np.concatenate([[p[0]], (p[1:] + p[:-1]) / 2, [p[-1]]]) for p in (x, y))
+    picture = elements.draw_cells(
+        ax,
+        *edges,
+        sigma,
+        wcs,
         cmap=colormaps["viridis"].with_extremes(bad="#e6e6e6"),
         vmax=np.percentile(good, 99) if good.size else None,  # a steep corner must not flatten the rest
-        shading="nearest",
-        rasterized=True,
     )
     ax.figure.colorbar(picture, ax=ax, label=f"error per axis [{unit}]", extend="max", shrink=0.85)
     if stars is not None:
-        ax.plot(*np.asarray(stars, dtype=float).T, "x", color="white", markersize=7, mew=3)
-        ax.plot(*np.asarray(stars, dtype=float).T, "x", color="black", markersize=6, mew=1)
-    ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), xlabel="x [px]", ylabel="y [px]", aspect="equal")
+        places = elements.to_axes(ax, stars, wcs).T
+        ax.plot(*places, "x", color="white", markersize=7, mew=3)
+        ax.plot(*places, "x", color="black", markersize=6, mew=1)
+    elements.frame(ax, (x[0], y[0]), (x[-1], y[-1]), wcs)
     elements.set_title(ax, "Error of a corrected position")
     return ax
 

@@ -1,5 +1,7 @@
 """Pictures of stacks: the mosaic, and the same stars as several corrections leave them (paper, Figure "stars2")."""
 
+from functools import partial
+
 import numpy as np
 
 from ..exceptions import InputError
@@ -23,7 +25,12 @@ def plot_mosaic(mosaic, *, stars=None, max_size=900, ax=None):
     max_size : int
         Larger images are averaged in blocks for display; the axes stay in mosaic pixels.
     ax : `~matplotlib.axes.Axes`, optional
-        Where to draw.
+        Where to draw; WCSAxes too, of the mosaic or of another image of that sky.
+
+    Raises
+    ------
+    InputError
+        If no pixel has data, or WCSAxes and mosaic have no sky in common.
     """
     ax = elements.new_axes(ax, (7.0, 7.0))
     data = np.asarray(mosaic.data)
@@ -37,14 +44,17 @@ def plot_mosaic(mosaic, *, stars=None, max_size=900, ax=None):
     low, high = np.arcsinh(-1.2), max(np.arcsinh((high - sky) / soft), 4.0)
     height, width = (block * n for n in image.shape)
     extent = (-0.5, width - 0.5, -0.5, height - 0.5)
-    elements.draw_image(ax, image, sky=sky, soft=soft, low=low, high=high, extent=extent)
+    wcs = partial(getattr, mosaic, "wcs")
+    elements.draw_image(ax, image, sky=sky, soft=soft, low=low, high=high, extent=extent, wcs=wcs)
     limits = np.array([_covered(image, axis, block) for axis in (0, 1)])
     if stars is not None:
         stars = np.asarray(stars, dtype=float)
         seen = np.flatnonzero(((stars > limits[:, 0]) & (stars < limits[:, 1])).all(axis=1))
-        dots = ax.scatter(*stars[seen].T, s=81, facecolors="none", edgecolors=elements.RED, linewidths=0.9)
+        dots = ax.scatter(
+            *elements.to_axes(ax, stars[seen], wcs).T, s=81, facecolors="none", edgecolors=elements.RED, linewidths=0.9
+        )
         elements.mark(dots, stars=seen)
-    ax.set(xlim=limits[0], ylim=limits[1], xlabel="x [px]", ylabel="y [px]")
+    elements.frame(ax, *limits.T, wcs)
     elements.set_title(ax, "Mosaic less its smooth sky (asinh stretch)")
     return ax
 

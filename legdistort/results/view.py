@@ -618,7 +618,7 @@ class View(ShownAsPrinted):
         scale : float, optional
             Magnification.
         ax : `~matplotlib.axes.Axes`, optional
-            Where to draw.
+            Where to draw; WCSAxes too (``projection=view.wcs``, or that of another image).
 
         Returns
         -------
@@ -627,7 +627,7 @@ class View(ShownAsPrinted):
         Raises
         ------
         InputError
-            If none of the positions was used, or the scale is not positive.
+            If none of the positions was used, the scale is not positive, or WCSAxes and exposure have no sky in common.
 
         Examples
         --------
@@ -646,7 +646,7 @@ class View(ShownAsPrinted):
         absolute : bool
             With the error of the common map.
         ax : `~matplotlib.axes.Axes`, optional
-            Where to draw.
+            Where to draw; WCSAxes too (``projection=view.wcs``, or that of another image).
 
         Returns
         -------
@@ -655,7 +655,7 @@ class View(ShownAsPrinted):
         Raises
         ------
         InputError
-            Where several detectors have pixels of their own.
+            Where several detectors have pixels of their own, or WCSAxes and exposure have no sky in common.
         FoldError
             If the distortion folds.
 
@@ -666,7 +666,7 @@ class View(ShownAsPrinted):
         >>> view.plot_error_map().get_xlabel()
         'x [px]'
         """
-        return solution_plots.plot_sigma_map(*self.sigma_map(absolute=absolute), ax=ax)
+        return solution_plots.plot_sigma_map(*self.sigma_map(absolute=absolute), wcs=lambda: self.wcs, ax=ax)
 
     # -- words
 
