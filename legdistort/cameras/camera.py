@@ -477,7 +477,8 @@ class Camera(ShownAsPrinted):
         if exposure.shape != self[key].shape:
             (ny, nx), binned = exposure.shape, ""
             if self.name == "GSAOI" and ny == nx:
-                binned = f", or if pixels are binned give Camera.gsaoi(size={nx}), its file (Camera.write) as --camera"
+                binned = ", as subarrays need it (this camera is of whole detectors), or if pixels are binned give "
+                binned += f"Camera.gsaoi(size={nx}), its file (Camera.write) as --camera"
             raise InputError(
                 f"{exposure.name} has shape {exposure.shape}, detector {key} of camera {self.name} {self[key].shape} "
                 "(ny, nx): is it a camera of another instrument? Else leave the camera "

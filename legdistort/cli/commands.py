@@ -112,6 +112,7 @@ def do_run(a):
 
 def do_measure(a):
     """``legdistort measure``."""
+    from ..inputs.exposure_names import whole_name
     from ..measurement.earlier import write_detections
     from ..measurement.options import MeasureOptions
 
@@ -124,9 +125,11 @@ def do_measure(a):
     table.meta["left_out"] = bad
     reading = given(a, {"ext": options.FRAMES["ext"]}, options.FLAGGED)
     write_detections(a.out, table, exposures, a.out.parent, measuring=asked, **reading, overwrite=a.overwrite)
+    whole, n = len({whole_name(each) for each in exposures}), len(exposures)
+    images = f", {n} images" * (whole < n)
     _say(
         a,
-        f"{len(table)} detections in {len(exposures)} exposures",
+        f"{len(table)} detections in {whole} exposure{'s' * (whole != 1)}{images}",
         {"n_detections": len(table), "shapes": shapes, "left_out": bad},
     )
 

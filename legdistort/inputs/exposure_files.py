@@ -41,6 +41,7 @@ from .fits_images import from_hdulist, planes_of, told_as_damaged, with_weights,
 from .foreign_images import from_nddata, is_nddata, read_roman
 from .frames.pixel_flags import good_bits
 from .frames.weight_maps import WeightMaps, WeightPlane
+from .sky_wcs import said_once
 
 if TYPE_CHECKING:
     from astropy.wcs.wcsapi import BaseHighLevelWCS
@@ -291,7 +292,7 @@ def _read_each(paths, read, ext, maps, progress, bad=None, copies=None):
     sources = maps.frames_of(expand_paths(paths))
     parts = _parts(sources, ext)
     bar = Bar(total=sum(map(len, parts)), desc="reading", unit="frame", disable=not progress)
-    with bar, contextlib.closing(_one_after_another(sources, parts, maps)) as opened:
+    with bar, said_once(), contextlib.closing(_one_after_another(sources, parts, maps)) as opened:
         for i, source, ext, key in opened:
             bar.update()
             try:

@@ -5,6 +5,8 @@ interface for world coordinates (APE 14) and leads to the sky, such as a gwcs.
 """
 
 import logging
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 import gwcs
 import numpy as np
@@ -26,6 +28,8 @@ PIXEL_SCALES = (0.0001 / 3600, 0.1)
 REFERENCE_DISTANCE = 20
 #: Part of a detector, at its border, that may see no sky (0.004 of that of MIRI).
 BORDER = 0.02
+#: Names of frames whose WCS is not used by the reason, within a block of `said_once`.
+_UNUSED = ContextVar("_UNUSED", default=None)
 
 
 @offline()
@@ -65,7 +69,7 @@ def believable_wcs(wcs, shape, name="", *, level=logging.INFO):
             f"{type(wcs).__name__}"
         )
     if reason:
-        log.log(level, "%s: WCS of the header not used: %s", name, reason)
+        _say_unused(name, reason, level)
         return None
     return wcs
 
@@ -75,8 +79,29 @@ def header_wcs(header, hdulist, shape, name, *, level=logging.INFO):
     try:
         return believable_wcs(image_wcs(header, hdulist), shape, name, level=level)
     except Exception as error:  # wcslib raises many kinds; a header WCS is a hint, never a must
-        log.log(level, "%s: WCS of the header not used: %s", name, error)
+        _say_unused(name, str(error), level)
         return None
+
+
+@contextmanager
+def said_once():
+    """A block that reads frames; after it one line for each reason names those whose WCS is not used."""
+    found = {}
+    token = _UNUSED.set(found)
+    try:
+        yield
+    finally:
+        _UNUSED.reset(token)
+        for (reason, level), names in found.items():
+            log.log(level, "%s: WCS of the header not used: %s", some_of(names, 4), reason)
+
+
+def _say_unused(name, reason, level):
+    """Say why the WCS of a frame is not used, now or at the end of the block of `said_once`."""
+    if (found := _UNUSED.get()) is not None:
+        found.setdefault((reason, level), []).append(name)
+    else:
+        log.log(level, "%s: WCS of the header not used: %s", name, reason)
 
 
 def image_wcs(header, hdulist=None):

@@ -48,6 +48,28 @@ def test_a_file_is_opened_once_for_all_its_detectors(tmp_path, monkeypatch, pack
     assert all(np.array_equal(a.data, b.data) for a, b in zip(alone, ld.read_exposures(path, ext="SCI"), strict=True))
 
 
+def test_frames_without_a_sky_and_their_exposures_are_told_once(tmp_path, capsys):
+    """One line for all of a reason; detectors of an exposure are no exposures."""
+    rng = np.random.default_rng(1)
+    y, x = np.mgrid[:64, :64]
+    for name in ("a", "b"):
+        images = [fits.PrimaryHDU()]
+        for k in (1, 2):
+            stars = sum(3000 * np.exp(-((x - c) ** 2 + (y - d) ** 2) / 4) for c, d in ((20, 20), (40, 45)))
+            image = fits.ImageHDU((stars + rng.normal(100, 5, (64, 64))).astype("f4"), name="SCI", ver=k)
+            image.header["DETECTOR"] = str(k)
+            images.append(image)
+        fits.HDUList(images).writeto(tmp_path / f"{name}.fits")
+    words = ["--ext", "SCI", "--psf", "moffat", "--workers", "1", "--out", str(tmp_path / "stars.ecsv")]
+    assert main(["measure", str(tmp_path / "a.fits"), str(tmp_path / "b.fits"), *words]) == 0
+    out, err = capsys.readouterr()
+    told = [line for line in err.splitlines() if "not used" in line]
+    assert told == ["a_SCI1, a_SCI2, b_SCI1, b_SCI2: WCS of the header not used: it has no celestial axes"]
+    assert out == "8 detections in 2 exposures, 4 images\n"
+    assert main(["measure", str(tmp_path / "a.fits"), *words, "--overwrite"]) == 0
+    assert capsys.readouterr().out == "4 detections in 1 exposure, 2 images\n"
+
+
 def test_a_file_exchanged_between_two_detectors_is_noticed(tmp_path, monkeypatch):
     path = mosaic_file(tmp_path / "a.fits", ("SCI", 1), ("SCI", 2))
     read = exposure_files.from_hdulist

@@ -18,6 +18,7 @@ import legdistort as ld
 from legdistort.exceptions import InputError, LegdistortWarning
 from legdistort.geometry import basis
 from legdistort.solving.checks.limits import addition_that_shows
+from legdistort.solving.checks.reference_check import _missing
 from legdistort.solving.gauge import bent_reference
 
 
@@ -44,6 +45,17 @@ def test_a_right_reference_is_believed_where_exposures_cannot_test_its_shape():
     assert check_of(solution, "absolute").sentence.endswith(
         "they rest on the reference (not tested) and the static distortion given"
     )
+
+
+def test_a_turned_camera_is_no_cure_where_it_was_turned():
+    def cure(*rolls):
+        turned = np.radians(rolls)
+        return _missing([np.array([[np.cos(a), -np.sin(a), 3.0], [np.sin(a), np.cos(a), -2.0]]) for a in turned])
+
+    without = "more of its stars, dithers by a good part of the field, or a prior test it"
+    assert cure(0, 0, 30) == cure(170, -90) == cure(5, 5, -85) == without
+    assert cure(0.0, 0.5) == cure(179, -179) == cure(30) == without.replace("or a prior", "a turned camera, or a prior")
+    assert check_of(solved(0)).cure == without  # of rolls up to 30 degrees
 
 
 def test_absolute_positions_do_not_pass_on_a_reference_that_fails():

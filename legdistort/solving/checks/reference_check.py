@@ -29,7 +29,9 @@ _NEARER = (
     "a prior of the static distortion (--prior), from which the plane has less far to go, or more of its stars; else "
     "leave it out"
 )
-_TESTED = "more of its stars, dithers by a good part of the field, a turned camera, or a prior test it"
+_TESTED = "more of its stars, dithers by a good part of the field, {}or a prior test it"
+#: Rolls [degrees] from which on to turn the camera is no news.
+_TURNED = 10.0
 
 
 def reference_check(solution, camera=None):
@@ -120,9 +122,16 @@ def _in_words(solution, tie, label):
         untested.append(f"that it is not bent{least} is believed")
     if untested:
         found = f"{agrees}; {' and '.join(untested)}, not tested"
-        return Check("reference", "unknown", made.unseen, SEEN * error, found, _TESTED)
+        return Check("reference", "unknown", made.unseen, SEEN * error, found, _missing(solution.poses.values()))
     bent = f"; a bend of {made.unseen:.2g} px rms would show" if ties else "; they tie shift, rotation and scale alone"
     return Check("reference", "pass", ratio, None, agrees + bent)
+
+
+def _missing(poses):
+    """What would test the shape of a reference beside what exposures with these poses (2, 3) have: a turned camera."""
+    angles = np.array([np.arctan2(pose[1, 0], pose[0, 0]) for pose in poses])
+    rolls = np.degrees(np.abs(np.angle(np.exp(1j * (angles - angles[0])))))
+    return _TESTED.format("" if rolls.max() > _TURNED else "a turned camera, ")
 
 
 def _error(solution):
