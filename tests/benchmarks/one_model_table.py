@@ -56,6 +56,8 @@ ROWS = {
 for _error in (0.1, 0.3, 1.0, 5.0):
     ROWS[f"one exposure of {_error} px, exact prior"] = ({"static": 1.0, "poor": (1, _error)}, True)
 ROWS["8 of 11 exposures 10 times noisier, exact prior"] = ({"static": 1.0, "noisier": (8, 10.0)}, True)
+ROWS["8 of 11 noisier, departures 3, exact prior"] = ({"static": 1.0, "dynamic": 3.0, "noisier": (8, 10.0)}, True)
+ROWS["8 of 11 noisier, departures 3, static 1.5"] = ({"static": 1.5, "dynamic": 3.0, "noisier": (8, 10.0)}, False)
 for _count in (15, 11):
     ROWS[f"one exposure of {_count} stars, exact prior"] = ({"static": 1.0, "few": _count}, True)
 

@@ -92,6 +92,17 @@ def test_large_distortions_cost_no_chi2(row, seed):
     assert off(positions(solution), truth["stars"], 3) < 1.5 * stated
 
 
+def test_few_precise_exposures_count_among_many_noisy_ones():
+    """By the typical error a bend of the plane would not show in this set: 1.36 times the degrees of freedom."""
+    data, truth = dense_model.drawn_set(7, static=1.0, dynamic=3.0)
+    noisy = data["exposure"] >= 3
+    noise = np.random.default_rng(7).normal(size=data["err"].shape)
+    data["xy"] = data["xy"] + noisy[:, None] * np.sqrt(99) * data["err"] * noise
+    data["err"] = data["err"] * np.where(noisy, 10, 1)[:, None]
+    solution = solved(data, ld.Prior(truth["static"]), clip=None)
+    assert solution.chi2 / solution.dof < 1 + 4 * np.sqrt(2 / solution.dof)
+
+
 @pytest.mark.parametrize(
     "row", [pytest.param(row, marks=pytest.mark.sets if k % 2 else pytest.mark.slow) for k, row in enumerate(ROWS)]
 )

@@ -247,12 +247,16 @@ def test_a_worthless_star(setting, seed, solved):
     assert_as_good(first, more.solved())
 
 
+#: The scatter of exposures is found, or given, and takes part in where the stars are.
+SCATTERS = "plain", "clipped", "prior", "evidence", "large distortions", "motions", "motions by evidence"
+
+
 @pytest.mark.parametrize(("setting", "seed"), cases(*FOUND))
 def test_a_worthless_exposure(setting, seed, solved):
     """One of 20 px, or of 200 px where beside the scatter of exposures one of 20 px is worth a hundredth of another."""
     one, first = solved(setting, seed)
     rows = np.flatnonzero(one.columns["exposure"] == 2)
-    scatters = setting in ("prior", "evidence", "large distortions", "motions", "motions by evidence")
+    scatters = setting in SCATTERS
     error, rng = 200.0 if scatters else 20.0, np.random.default_rng((seed, 2))
     noise = {axis: one.columns[axis][rows] + rng.normal(0, error, len(rows)) for axis in "xy"}
     wide = np.full(len(rows), error)

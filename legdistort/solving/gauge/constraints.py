@@ -75,7 +75,7 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
         moved = np.concatenate([others @ motion @ maps.T, others @ drifting @ drifts.T], axis=2)
         dynamic, nightly, told = dynamic_covariance(problem, state, error, moved, others, night, group, static)
     # about a static distortion that was found widths tell nothing of the plane, which exposures that show it hold
-    told_by_widths = held & ~(all_drifts and problem.centre is not None)
+    told_by_widths = held & (problem.centre is None or (problem.floats and not all_drifts))
     spread = others @ (dynamic + np.where(told_by_widths, 0, 1)[:, None, None] * error) @ others.transpose(0, 2, 1)
     weight = np.where(told_by_widths, 1, influence(error, others))[:, None, None] * np.linalg.inv(spread)
     positions = state.positions.T[used]

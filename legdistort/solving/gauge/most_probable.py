@@ -130,7 +130,7 @@ def counts(problem, state, shown=1.0):
 
     To first order it does not. In second order it does, by its product with the gradients of the distortions: then a
     plane that a convention holds elsewhere keeps the data from their minimum. It would move stars by more than `shown`
-    typical errors.
+    errors of an observation of the mean weight: few precise exposures show what many noisy ones do not.
     """
     if not is_possible(problem):
         return False
@@ -143,14 +143,13 @@ def counts(problem, state, shown=1.0):
     known = _Known.of(problem, problem.degree)
     departures = known.values(state, np.zeros(known.n_statics))[: known.width.size].reshape(problem.n_exposures, -1)
     gradient = 2 * problem.degree / problem.size.mean()
-    error = 1 / np.sqrt(np.median(problem.weight[0][problem.weight[0] > 0]))
+    error = np.sqrt(problem.weight[0].sum() / (problem.weight[0] ** 2).sum())  # what is worthless counts for nothing
     limit = 4 * shown * error / gradient  # b_m has mean square 1/4
     squares = np.sum(departures**2, axis=1)
     if np.mean(squares) <= limit:
         return False
-    whole = replace(
-        problem, prior_mean=_padded(problem.prior_mean, state)
-    )  # what they have in common beyond the degree
+    # with what they have in common beyond the degree
+    whole = replace(problem, prior_mean=_padded(problem.prior_mean, state))
     own = known.others @ conditional_errors(criterion.linearise(whole, state).u_data) @ known.others.mT
     noise, chance = np.einsum("ikk->i", own), np.sqrt(2 * np.einsum("ikl,ikl->i", own, own))
     seen = squares > noise + _SEEN * chance  # an exposure that is worth little departs far for nothing
