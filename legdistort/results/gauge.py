@@ -86,11 +86,14 @@ class UnknownDirection:
         How it moves the stars: 1 px, rms per axis, pixels.
     coefficients : ndarray, shape (n_exposures, 2, n_modes)
         How the coefficients change with it, pixels.
+    motions : ndarray, shape (n_stars, k), or None
+        How it changes the motions and parallaxes of stars, pixels a year and pixels; None where these stay.
     """
 
     name: str
     stars: np.ndarray = field(metadata=array("n_stars", 2, unit="pix", nan=True))
     coefficients: np.ndarray = field(metadata=array("n_exposures", 2, "modes", unit="pix"))
+    motions: np.ndarray | None = field(default=None, metadata=array("n_stars", "n_terms", unit="pix/yr, pix", nan=True))
 
     def __repr__(self) -> str:
         return f"<UnknownDirection: {self.name}>"
@@ -507,9 +510,10 @@ class Gauge(ShownAsPrinted):
         lines += [self.warning[0].upper() + self.warning[1:] + "."] if self.warning else []
         lines += [] if self.drift is None else [str(self.drift)]
         if self.drift is not None and not (self.drift.n_tied or self.nights_told) and self.static == "fitted":
+            weak = self.responses is not None and self.responses.weak
             lines.append(
-                "Too few nights tell such a map of motions from the static distortion that all exposures share: the "
-                "absolute error of a motion may be many times too small or too large."
+                "Too few nights tell such a map of motions from the static distortion that all exposures share: "
+                + ("absolute errors of motions are not known." if weak else "these errors may be far too large.")
             )
         if self.static == "open":
             return "\n".join(lines)

@@ -55,6 +55,7 @@ def stars(solution, time=None):
         new_positions.add_sky(table, sky, xy, variance, absolute)
         table["sky"] = SkyCoord(table["ra"], table["dec"], frame="icrs", obstime=obstime)
     if motions is not None:
+        covariances[1] = absolute_errors.without_unknown_motions(solution.gauge, covariances[1])
         star_motions.add_motions(table, motions, *covariances, xy, sky)
         if sky is not None:
             moving = {"pm_ra_cosdec": table["pmra"], "pm_dec": table["pmdec"]}
@@ -141,7 +142,7 @@ def _absolute(solution, without_unknown):
 def _unknowns(solution):
     """Relative and absolute covariance (n_stars, 2 + k, 2 + k) of positions, motions and parallaxes."""
     known = solution.gauge, solution.estimate.uncertainty, solution.estimate.positions
-    return absolute_errors.relative_blocks(*known), absolute_errors.absolute_blocks(*known)
+    return [absolute_errors.relative_blocks(*known), absolute_errors.absolute_blocks(*known)]
 
 
 def _meta(solution):

@@ -96,7 +96,10 @@ def row(words, n, *, one=True):
 
 
 def motions(n_nights, n, **how):
-    """Squared pull of absolute motions over n sets of some nights that differ in nothing but a turn, and by set."""
+    """Squared pull of absolute motions over n sets of some nights that differ in nothing but a turn, and by set.
+
+    And the share of stars of which an absolute error is stated.
+    """
     sums = []
     for seed in range(n):
         nights = Nights(seed, nights=n_nights, nightly=0.0, single=0.0, motion=0.02, n_stars=120)
@@ -107,9 +110,12 @@ def motions(n_nights, n, **how):
         off = v - nights.motion[np.asarray(stars["star"], int)] @ [1, 1j]
         common = np.stack([np.ones(len(z)), z - z.mean()], axis=1)
         off = off - common @ np.linalg.lstsq(common, off, rcond=None)[0]
-        sums.append([np.sum(np.abs(off) ** 2), np.sum(stars["vx_err_abs"].value ** 2 + stars["vy_err_abs"].value ** 2)])
-    off, stated = np.array(sums).T
-    return off.sum() / stated.sum(), off / stated
+        stated = stars["vx_err_abs"].value ** 2 + stars["vy_err_abs"].value ** 2
+        known = np.isfinite(stated)
+        sums.append([np.sum(np.abs(off[known]) ** 2), np.sum(stated[known]), np.mean(known)])
+    off, stated, known = np.array(sums).T
+    with np.errstate(invalid="ignore"):
+        return off.sum() / stated.sum(), off / stated, known.mean()
 
 
 def main():
@@ -123,9 +129,9 @@ def main():
     if asked.motions:
         for static in ("fit", None):
             for n_nights in (2, 3, 4, 5):
-                pooled, single = motions(n_nights, asked.sets, **({"static": static} if static else {}))
+                pooled, single, known = motions(n_nights, asked.sets, **({"static": static} if static else {}))
                 sets = f"single sets {single.min():9.4f} to {single.max():.4f}"
-                print(f"static={static} {n_nights} nights {pooled:9.4f}   {sets}", flush=True)
+                print(f"static={static} {n_nights} nights {pooled:9.4f}   {sets}, stated of {known:.2f}", flush=True)
         return
     heads = "pull^2", "finite", "one", "finite", "rms", "without", "named", "false", "twice"
     heads += "median", "rms", "most"

@@ -58,6 +58,19 @@ def absolute_blocks(gauge, uncertainty, xy):
     return out
 
 
+def without_unknown_motions(gauge, covariance):
+    """Covariances (n_stars, 2 + k, 2 + k) with NaN for what moves stars where an unknown direction changes it by more.
+
+    A direction that moves the stars by a pixel, rms.
+    """
+    out = covariance.copy()
+    for each in gauge.unknown:
+        if each.motions is not None:
+            lost = np.pad(each.motions**2 > np.einsum("jaa->ja", out)[:, 2:], ((0, 0), (2, 0)))
+            out[lost[:, :, None] | lost[:, None, :]] = np.nan
+    return out
+
+
 def _common(gauge, uncertainty, xy):
     """How common maps move the unknowns of the stars, (n_stars, 2 + k, c), and the covariance (c, c) of these maps."""
     if gauge.drift is None:

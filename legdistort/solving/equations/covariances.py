@@ -366,11 +366,11 @@ class Uncertainty:
         system = self.system
         made = []
         for d in system.moves[self._gauge.n_constraints :]:
-            stars, coefficients = system.follow(d)[:2], problem.unknowns.spread(d)
-            unit = self._unit(stars)
-            made.append(
-                UnknownDirection("static", stars.T / unit, (coefficients / unit).reshape(len(coefficients), 2, -1))
-            )
+            whole, coefficients = system.follow(d), problem.unknowns.spread(d)
+            unit = self._unit(whole[:2])
+            stars, motions = whole[:2].T / unit, whole[2:].T / unit if problem.terms.n else None
+            coefficients = (coefficients / unit).reshape(len(coefficients), 2, -1)
+            made.append(UnknownDirection("static", stars, coefficients, motions))
         return tuple(made)
 
     @cached_property
