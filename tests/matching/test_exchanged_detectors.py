@@ -6,13 +6,14 @@ Then no detector by itself ties the exposures before and after the turn to each 
 from dataclasses import replace
 
 import header_layouts
+import numpy as np
 import pytest
 from astropy.table import QTable
 from astropy.wcs import WCS
 
 import legdistort as ld
 from legdistort.cameras.exchanged import check_places
-from legdistort.exceptions import InputError
+from legdistort.exceptions import AssumptionWarning, InputError
 
 
 def night_of(seed, rolls, **options):
@@ -39,9 +40,21 @@ def with_two_exchanged(exposures):
     return out
 
 
-def test_exchanged_detectors_are_named():
+def test_exchanged_headers_are_set_right():
     """Stars of exposures that are turned do not prove the wrong places which they were matched in."""
     night = night_of(3, (0.0, 0.0, 0.0, 0.0, 0.0, 30.0, 90.0, 90.0), off=1.0)
+    right, wrong = night.exposures, with_two_exchanged(night.exposures)
+    with pytest.warns(AssumptionWarning, match="the headers have detectors 2 and 3 in each other's places: with the"):
+        matches = ld.match(night.table, exposures=wrong)
+    assert len(night.found(matches)) > 0.95 * len(night.crossing())
+    places = {key: each.layout for key, each in ld.Camera.of_frames(right).detectors.items()}
+    for key, layout in places.items():
+        np.testing.assert_allclose(matches.camera[key].layout, layout, atol=1e-6)
+
+
+def test_a_camera_with_two_exchanged_is_refused():
+    night = night_of(3, (0.0, 0.0, 0.0, 0.0, 0.0, 30.0, 90.0, 90.0), off=1.0)
+    wrong = with_two_exchanged(night.exposures)
     words = r"detectors 2 and 3 of camera \w+ seem to be exchanged: .* camera in which they are where they belong"
     with pytest.raises(InputError, match=words):
-        ld.match(night.table, exposures=with_two_exchanged(night.exposures))
+        ld.match(night.table, exposures=wrong, camera=ld.Camera.of_frames(wrong))
