@@ -210,7 +210,8 @@ def _tie(rows, exposure, star, xy, weighted, names):
         if len(r) < 2 or np.all(np.ptp(xy[r], axis=0) == 0):
             raise MatchError(
                 f"exposure {names[best]} shares {len(r)} star{'s' * (len(r) != 1)} with the other exposures; its shift "
-                "and rotation need at least 2: give poses, or leave it out"
+                "and rotation need at least 2: give poses, or leave it out, without= (--without); the layout in a "
+                "solution of the others may tie it, camera= (--camera)"
             )
         mean = sums[star[r]] / counts[star[r], None]
         found[best] = similarity.robust_similarity(mean, xy[r])

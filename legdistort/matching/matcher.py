@@ -12,8 +12,8 @@ from astropy import units as u
 
 from ..cameras import ties
 from ..cameras.camera import Camera, check_camera
-from ..cameras.exchanged import check_places
-from ..exceptions import InputError, MatchError, reasons_of
+from ..cameras.exchanged import check_places, exchanged
+from ..exceptions import AssumptionWarning, InputError, MatchError, reasons_of, warn
 from ..geometry.epochs import header_epoch, mean_epoch
 from ..geometry.zenith import stated_zenith
 from ..inputs import column_contract
@@ -153,12 +153,15 @@ def match(
         _add_stated(table, {whole_name(exposure): exposure for exposure in exposures or ()}, options.keywords)
         again = vars(replace(options, columns=None))
         return detector_layout.match_parts(table, shapes, lambda parts, shape: match(parts, shape=shape, **again))
-    found = labelled(table, exposures, shape, camera, options)
+    found, is_given = labelled(table, exposures, shape, camera, options), camera is not None
     camera, named, shapes, left_out = found.camera, found.named, found.shapes, found.left_out
     table, star, several = found.table, found.star, len(found.names) > 1
     star[~_isolated(table, isolation)] = -1
     if camera is not None and several:
-        _check_detectors(camera, table, star, shapes)
+        mended = _with_headers_exchanged(camera, table, star, shapes, None if is_given else exposures)
+        if mended is not None:
+            again = vars(replace(options, columns=None)) | {"camera": Camera.of_frames(mended)}
+            return match(detections, exposures=mended, shape=shape, **again)
     tying = _ties_of_few(camera, table, star, min_exposures) if camera is not None and several else None
     table, star = _keep_common(table, star, min_exposures if several else 1, left_out, tying, tell=True)
     epoch = mean_epoch(e.header for e in named.values()) if named else None
@@ -168,11 +171,28 @@ def match(
     return replace(matches, left_out=found.copies | left_out, camera=camera)
 
 
-def _check_detectors(camera, table, star, shapes):
-    """`check_places` with all stars that were found twice: few of those that cross are in many exposures."""
+def _with_headers_exchanged(camera, table, star, shapes, exposures):
+    """Exposures with the headers of two detectors exchanged, with a warning, where the stars tell so; None if not.
+
+    With all stars that were found twice: few of those that cross are in many exposures. `InputError` where the places
+    are not those of headers (exposures None), or an exposure has one of the two alone.
+    """
     table, star = _keep_common(table, star, 2, {})
     table["star"] = star
-    check_places(replace(Matches.from_table(table, shape=shapes, allow_copies=True), camera=camera))
+    matches = replace(Matches.from_table(table, shape=shapes, allow_copies=True), camera=camera)
+    found = exchanged(matches)
+    if found is None:
+        return None
+    mended = detector_layout.with_headers_exchanged(exposures or (), found.pair)
+    if mended is None:
+        check_places(matches)
+    a, b = found.pair
+    warn(
+        f"the headers have detectors {a} and {b} in each other's places: {found.words}; each is taken to have the "
+        "header of the other, and the night goes on; mend the headers",
+        AssumptionWarning,
+    )
+    return mended
 
 
 def _check_measured(detections):

@@ -159,6 +159,15 @@ def stated_layout(exposures):
     return name or "camera", {key: replace(each, layout_sigma=np.inf) for key, each in detectors.items()}
 
 
+def with_headers_exchanged(exposures, pair):
+    """Exposures of which two detectors have the WCS of each other; None where one has a single one of them, or none."""
+    partner, by_part = dict(zip(pair, pair[::-1], strict=True)), {(e.exposure, e.detector): e for e in exposures}
+    others = {e.name: by_part.get((e.exposure, partner[e.detector])) for e in exposures if e.detector in partner}
+    if not others or None in others.values():
+        return None
+    return [replace(e, wcs=others[e.name].wcs) if e.name in others else e for e in exposures]
+
+
 def reference_pixels(exposures):
     """``{id: (x, y)}``, from 0, of the detectors whose headers are FITS WCSs, of the exposure that has most."""
     found = {each.detector: getattr(each.wcs, "wcs", None) for each in fullest(exposures)}
