@@ -1008,7 +1008,9 @@ class TestFrames:
             ):
                 camera.of_detectors(exposures)
         else:
-            matches = legdistort.match(legdistort.measure(exposures), exposures=exposures, min_exposures=3)
+            table = legdistort.measure(exposures)
+            with pytest.warns(AssumptionWarning, match="hardly a detection of detector 3 fits"):  # its image is turned
+                matches = legdistort.match(table, exposures=exposures, min_exposures=3)
             assert list(matches.camera.detectors) == ["1", "2", "3"]
 
     def test_a_camera_of_another_instrument(self, measured, gsaoi):
