@@ -55,7 +55,12 @@ def make_solution(
             positions=positions,
             shapes=dict.fromkeys(names, shape),
             prior_mean=mean if prior else np.zeros(size),
-            uncertainty=SimpleNamespace(coefficients=1e-4 * np.eye(coefficients.size), common=None, camera=None),
+            uncertainty=SimpleNamespace(
+                coefficients=1e-4 * np.eye(coefficients.size),
+                of_exposure=lambda i, n_exposures: 1e-4 * np.eye(coefficients.size // n_exposures),
+                common=None,
+                camera=None,
+            ),
         ),
         left_out={"bad <one>": "only 2 stars matched, <i>10</i> & more are needed"},
     )

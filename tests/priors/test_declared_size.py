@@ -246,7 +246,7 @@ def test_prediction_without_a_prior_is_relative_and_says_so(more):
     assert np.isfinite(free.sigma)
     assert np.isfinite(free.b)
     text = " ".join(str(free).split())
-    assert "are relative" in text
+    assert "is relative" in text
     assert free.solution.gauge.unknown
     assert free.solution.gauge.warning in text
     assert all(len(line) <= 110 for line in str(free).splitlines())
