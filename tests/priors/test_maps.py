@@ -343,7 +343,7 @@ def test_the_map_of_one_detector_of_a_camera(tmp_path, capsys):
         errors = [fits.getdata(p) for p in map_paths(tmp_path / f"chip{key}.fits")[2:]]
         assert 0.001 < np.min(errors) <= np.max(errors) < 0.2
         prior = ld.Prior.from_file(camera, ext=int(key))
-        assert prior.source == {"kind": "camera", "name": str(camera), "detector": key}
+        assert prior.source == {"kind": "camera", "name": str(camera), "camera": "FOUR", "detector": key}
         assert_array_equal(prior.mean, ld.Prior.from_file(results, ext=key).mean)
     # what all share the exposures may have, and a linear map the layout; from the pixels to the undistorted places
     apart = found["2"] - found["0"] + (bend[2] - bend[0]) @ np.stack([x**2, x * y, y**2]).reshape(3, -1)
