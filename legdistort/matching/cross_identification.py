@@ -20,6 +20,8 @@ log = logging.getLogger(__name__)
 _AGREEMENT = 0.05
 #: Part of the stars for which this holds where names are given to both lists alike; numbers by brightness often agree.
 _NAMED_ALIKE = 0.95
+#: Times the distance of another star, and of most of one name, from which on one of the same name is not the same star.
+_OTHER = 10.0
 #: Part of the field that the plane of the catalogue may be off.
 _MARGIN = 0.5
 #: Chance that a star which is near by accident is taken for a reference star.
@@ -154,6 +156,8 @@ def _despite_sky(reference, positions, flux, sky, pixel_scale, error):
 def same_stars(one, two, label):
     """Rows of the stars that two lists have in common: by name where these lie alike, else by their places.
 
+    Two of one name are not the same where another star stands in the place of one, and the other far away.
+
     Parameters
     ----------
     one, two : (names, positions, flux)
@@ -181,6 +185,11 @@ def same_stars(one, two, label):
         by_name = 2 * len(mine) > min(len(own[0]), len(names))
     except InputError:
         by_name = False
+    else:
+        there = similarity.apply(similarity.robust_similarity(own[1][mine], xy[theirs]), own[1][mine])
+        off, nearest = np.linalg.norm(there - xy[theirs], axis=1), cKDTree(xy).query(there)[0]
+        same = off <= _OTHER * np.maximum(nearest, np.median(off))
+        mine, theirs = mine[same], theirs[same]
     if not by_name:
         mine, theirs, _ = _pairs(replace(named, star=None), *own, None, None)
         _check_agreement(label, own[1][mine], xy[theirs], size)

@@ -112,6 +112,19 @@ def test_a_star_that_is_somewhere_else_is_named():
     assert wrong.stars.table["dx"][0].value == pytest.approx(0.3, abs=0.06)
 
 
+def test_names_that_were_exchanged_are_of_other_stars():
+    """They are left out, in place of a difference of hundreds of pixels that all others show too."""
+    first, second = halves(Nights(11, nights=4, n_stars=80, roll=0.0))
+    usual = ld.difference(first, second).stars
+    table = second.residuals["exposure", "star", "x", "y", "x_err", "y_err"]
+    a, b = usual.table["star"][:2]
+    table["star"][...] = np.where(table["star"] == a, b, np.where(table["star"] == b, a, table["star"]))
+    found = ld.difference(first, ld.solve(ld.Matches.from_table(table, shape=(SIZE, SIZE)))).stars
+    assert len(found.table) == len(usual.table) - 2
+    assert not {a, b} & set(found.table["star"])
+    assert found.places.rms < 1.5 * usual.places.rms
+
+
 def test_years_without_motions_have_no_chance():
     """They are the motions of the stars, which no error of the two has; and without years there is one."""
     nights = Nights(2, nights=4, per=3, n_stars=120, motion=0.05)

@@ -4,12 +4,14 @@ import gsaoi_images
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import QTable
 from astropy.time import Time
 
 import legdistort
 from legdistort.cameras.camera import GSAOI_SCALE
 from legdistort.exceptions import InputError, MatchError
 from legdistort.inputs.exposures import Exposure
+from legdistort.matching.detectors import detector_layout
 
 SIGMA = 0.01
 
@@ -70,6 +72,17 @@ def test_no_star_crosses(night):
     words = r"how detectors 1 and 3 lie to each other is not known: .* on both .*1 \| 3.* give the camera"
     with pytest.raises(MatchError, match=words):
         legdistort.match(table[middle], shape=(2048, 2048), min_exposures=3)
+
+
+def test_parts_of_exposures_that_do_not_meet_are_no_fields():
+    """Groups that have detectors in common: what says how these lie is named, and fields are not."""
+    table = QTable({"exposure": ["e0", "e0", "e1", "e1"], "detector": ["1", "2", "1", "2"]})
+
+    def match(parts, shapes):
+        raise MatchError("2 groups", groups=[["e0-1", "e1-2"], ["e0-2", "e1-1"]])
+
+    with pytest.raises(MatchError, match=r"fall into 2 groups .*\(of detectors 1, 2 \| 1, 2\).* --wcs.* --camera"):
+        detector_layout.match_parts(table, dict.fromkeys("12", (100, 100)), match)
 
 
 def test_shapes(night):

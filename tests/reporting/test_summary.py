@@ -89,7 +89,7 @@ def test_a_night_has_what_its_exposures_have_in_common():
     assert all(0 < night["common_err_px"] < 0.1 for night in nights)
     sentence = next(check.sentence for check in solution.checks if check.name == "nights")
     named = f"night {nights[odd]['name']} ({', '.join(nights[odd]['exposures'])})"
-    told = re.search(rf"{re.escape(named)} .* others, by ([\d.]+) px, rms length of both axes together; what it", sentence)
+    told = re.search(rf"{re.escape(named)} .* others, by ([\d.]+) px, rms length of both axes", sentence)
     assert float(told[1]) == pytest.approx(common[odd], rel=0.1)
 
 

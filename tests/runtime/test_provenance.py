@@ -97,8 +97,8 @@ def test_a_frame_that_changes_while_it_is_read(pair, monkeypatch, swap, reading)
 
 
 @pytest.mark.slow
-def test_a_run_whose_frame_is_swapped_leaves_nothing(tmp_path, monkeypatch):
-    """The new frame has the shape of the old one, and would have passed for it."""
+def test_a_run_whose_frame_is_swapped_leaves_nothing_of_it(tmp_path, monkeypatch):
+    """The new frame has the shape of the old one, and would have passed for it; others that were measured are kept."""
     paths = simulate_exposures(small=True, seed=3).write(tmp_path / "frames")
     usual, done = exposure_files.ExposureFile.read, []
 
@@ -110,7 +110,8 @@ def test_a_run_whose_frame_is_swapped_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(exposure_files.ExposureFile, "read", read)
     with pytest.raises(InputError, match=f"{paths[2].name} has changed since it was first read"):
         ld.run(paths, out=tmp_path / "out", psf="moffat", degree=1)
-    assert [path.name for path in tmp_path.iterdir()] == ["frames"]
+    assert {path.name for path in tmp_path.iterdir()} <= {"frames", "out.measured"}
+    assert not list((tmp_path / "out.measured").rglob(f"{paths[2].stem}*"))
 
 
 @pytest.mark.parametrize("kind", ["table", "solution", "prior"])

@@ -8,7 +8,7 @@ way than those of the others, and farther or less far where its pixels are of an
 """
 
 from dataclasses import replace
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 
@@ -81,7 +81,7 @@ def match_parts(table, shapes, match):
     try:
         matches = match(table, {name: shapes[key] for name, (_, key) in part_of.items()})
     except MatchError as error:
-        _tell_apart([{part_of[name][1] for name in group} for group in error.groups])
+        _tell_apart([[part_of[name] for name in group] for group in error.groups])
         raise
     camera = Camera("camera", _layouts(matches.poses, part_of, shapes))
     made = matches.table.copy()
@@ -99,17 +99,25 @@ def _ids(table):
 
 
 def _tell_apart(groups):
-    """Raise `MatchError` if groups of exposures are those of different detectors."""
-    groups = sorted(sorted(set(group)) for group in groups)
+    """Raise `MatchError` if groups of ``(exposure, detector)`` are those of different detectors of exposures."""
+    exposures = [{exposure for exposure, _ in group} for group in groups]
+    groups = sorted(sorted({key for _, key in group}) for group in groups)
+    listed = " | ".join(", ".join(each) for each in groups)
     for k, group in enumerate(groups):
         for other in groups[k + 1 :]:
             if not set(group) & set(other):
-                listed = " | ".join(", ".join(each) for each in groups)
                 raise MatchError(
                     f"how detectors {group[0]} and {other[0]} lie to each other is not known: no star was found on "
                     f"both (detectors that share stars: {listed}), and neither a camera nor headers state it; dither "
                     "over the gap, or give the camera"
                 ) from None
+    if any(one & two for one, two in combinations(exposures, 2)):
+        raise MatchError(
+            f"how detectors lie to each other is not known: those of an exposure fall into {len(groups)} groups "
+            f"without a common star (of detectors {listed}), and neither a camera nor headers state it; give the "
+            "frames (--wcs) or a camera (--camera), such as that of a solution of another night, and leave out what "
+            "is no star, above all at the edges of detectors"
+        ) from None
 
 
 def _layouts(poses, part_of, shapes):
