@@ -30,8 +30,8 @@ _EQUAL, _REFITS = 0.005, 4
 #: Accuracy of fits on trial, in standard errors, rms over their unknowns; squares of residuals over those of the errors
 #: below which one leaves nothing that the reference plane could be estimated from.
 TRIAL, EXPLAINED = 0.03, 2.0
-#: Errors of an observation of the mean weight by which a bend of the plane moves stars in second order where it counts,
-#: and so where chance does not explain the residuals.
+#: Typical errors of an exposure of the mean weight by which a bend of the plane moves stars in second order where it
+#: counts, and so where chance does not explain the residuals.
 SHOWN, SHOWN_BY_MISFIT = 1.0, 0.25
 #: Times the least eigenvalue of what residuals show: below it, and with room for one that moves, the rest is held.
 _FREER = 0.5

@@ -81,7 +81,7 @@ def test_parts_of_exposures_that_do_not_meet_are_no_fields():
     def match(parts, shapes):
         raise MatchError("2 groups", groups=[["e0-1", "e1-2"], ["e0-2", "e1-1"]])
 
-    with pytest.raises(MatchError, match=r"fall into 2 groups .*\(of detectors 1, 2 \| 1, 2\).* --wcs.* --camera"):
+    with pytest.raises(MatchError, match=r"fall into 2 groups .*\(of detectors 1, 2 \| 1, 2\).*--wcs.*--camera"):
         detector_layout.match_parts(table, dict.fromkeys("12", (100, 100)), match)
 
 

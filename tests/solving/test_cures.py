@@ -111,12 +111,12 @@ def test_motions_are_the_cure_of_all_that_they_cause():
 
 
 def test_errors_that_are_wrong_are_not_taken_for_patterns():
-    """Bright stars with errors too small make tests of places fail; it is the errors that are named."""
+    """Bright stars with errors too small make tests of places and degrees fail; it is the errors that are named."""
     data = dense_model.drawn_set(2)[0]
     bright = data["err"][:, :1] < np.quantile(data["err"], 1 / 3)
     checks = checks_of(solved(data | {"err": np.where(bright, data["err"] / 2, data["err"])}))
     wrong = [check for check in checks.values() if check.state in ("warn", "fail")]
-    assert {"chi2", "place"} <= {check.name for check in wrong}
+    assert {"chi2", "degree"} <= {check.name for check in wrong}
     assert {check.cure for check in wrong} == {"--errors floor would bring chi2/dof to 1.00"}
 
 

@@ -175,7 +175,7 @@ def test_permutation_changes_nothing():
 
 
 def test_halved_errors_quarter_the_covariance():
-    sim = small(dynamic=0.1, static=0.3)  # no bend of the plane counts with these errors or those
+    sim = small()
     table = table_of(sim)
     for column in ("x_err", "y_err"):
         table[column] = table[column] / 2

@@ -130,7 +130,7 @@ def counts(problem, state, shown=1.0):
 
     To first order it does not. In second order it does, by its product with the gradients of the distortions: then a
     plane that a convention holds elsewhere keeps the data from their minimum. It would move stars by more than `shown`
-    errors of an observation of the mean weight: few precise exposures show what many noisy ones do not.
+    errors of an exposure of the mean weight: few precise exposures show what many noisy ones do not.
     """
     if not is_possible(problem):
         return False
@@ -143,7 +143,8 @@ def counts(problem, state, shown=1.0):
     known = _Known.of(problem, problem.degree)
     departures = known.values(state, np.zeros(known.n_statics))[: known.width.size].reshape(problem.n_exposures, -1)
     gradient = 2 * problem.degree / problem.size.mean()
-    error = np.sqrt(problem.weight[0].sum() / (problem.weight[0] ** 2).sum())  # what is worthless counts for nothing
+    typical = np.array([_median(problem.weight[0][problem.part(i)]) for i in range(problem.n_exposures)])
+    error = np.sqrt(typical.sum() / (typical**2).sum())  # what is worthless counts for nothing
     limit = 4 * shown * error / gradient  # b_m has mean square 1/4
     squares = np.sum(departures**2, axis=1)
     if np.mean(squares) <= limit:
@@ -154,6 +155,11 @@ def counts(problem, state, shown=1.0):
     noise, chance = np.einsum("ikk->i", own), np.sqrt(2 * np.einsum("ikl,ikl->i", own, own))
     seen = squares > noise + _SEEN * chance  # an exposure that is worth little departs far for nothing
     return bool(np.sum((squares - noise)[seen]) > limit * np.count_nonzero(seen | (noise < limit)))
+
+
+def _median(weight):
+    """Of the weights of observations that count, 0 without any."""
+    return np.median(weight[weight > 0]) if weight.any() else 0.0
 
 
 def most_probable(problem, state, *, loss="linear", sizes=None, max_steps=MAX_STEPS):
