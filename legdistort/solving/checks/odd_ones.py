@@ -75,8 +75,9 @@ def compared(a, noise, degrees, moved=None):
     variance = noise.copy()  # about, for weights
     for degree in each:
         of = degrees == degree
-        seen = ((a - a.mean(axis=0)) ** 2)[:, of].sum() / (np.count_nonzero(of) * (n - 1))
-        variance[:, of] += max(seen - noise[:, of].mean(), 0)
+        precise = 1 / np.maximum(noise[:, of], np.median(noise[:, of]))
+        off = a[:, of] - (precise * a[:, of]).sum(axis=0) / precise.sum(axis=0)
+        variance[:, of] += max(np.median(np.mean(off**2 - noise[:, of], axis=1)), 0)
     unit = np.sqrt(variance)
     rows = _orthonormal(design / unit[:, :, None])
     left = a / unit - rows @ np.einsum("ikp,ik->p", rows, a / unit)
@@ -100,6 +101,7 @@ def compared(a, noise, degrees, moved=None):
 def _of_others(left, rows, away, wide, noise, variance, degrees):
     """Variance (n, k) by which all but one scatter beyond their errors, by degree, for each, and degrees of freedom.
 
+    Squares count by the inverse of their variances: those of one that is worth little would hide what others show.
     Their residuals are ``left + rows b``, ``b = rows_k' away``, where the k-th is not in the fit.
     """
     n, step = len(left), np.einsum("ikp,ik->ip", rows, away)
@@ -108,17 +110,24 @@ def _of_others(left, rows, away, wide, noise, variance, degrees):
     scatter, freedom = np.empty_like(left), np.empty_like(left)
     for degree in np.unique(degrees):
         of = degrees == degree
-        mine, weight, there = rows[:, of].reshape(-1, rows.shape[2]), variance[:, of].ravel(), left[:, of].ravel()
+        mine, weight, there = rows[:, of].reshape(-1, rows.shape[2]), 1 / variance[:, of].ravel(), left[:, of].ravel()
         squares = weight @ there**2 + 2 * step @ (mine.T @ (weight * there))
         squares += np.einsum("ip,pq,iq->i", step, (weight[:, None] * mine).T @ mine, step)
-        squares -= (variance * away**2)[:, of].sum(axis=1)
+        squares -= (away**2 / variance)[:, of].sum(axis=1)
         power = mine.T @ mine
         free = np.count_nonzero(of) * (n - 1) - np.trace(power) - np.einsum("ipq,qp->i", drawn, power)
-        free = np.maximum(free + own[:, of].sum(axis=1), 0)
-        errors = (noise[:, of].sum() - noise[:, of].sum(axis=1)) / (np.count_nonzero(of) * (n - 1))
-        scatter[:, of] = np.maximum(squares / np.maximum(free, 1e-3) - errors, 0)[:, None]
-        freedom[:, of] = free[:, None]
+        free = np.maximum(free + own[:, of].sum(axis=1), 0) / (np.count_nonzero(of) * (n - 1))  # part of all others
+        by = _sum_of_others(variance[:, of] ** -1.0), _sum_of_others(variance[:, of] ** -2.0)
+        errors = free * _sum_of_others(noise[:, of] / variance[:, of] ** 2)
+        scatter[:, of] = (np.maximum(squares - errors, 0) / np.maximum(free * by[1], 1e-3 * by[1] / n))[:, None]
+        freedom[:, of] = (free * by[0] ** 2 / by[1])[:, None]
     return scatter, freedom
+
+
+def _sum_of_others(values):
+    """Of values (n, m) the sum of all but those of each, (n,)."""
+    own = values.sum(axis=1)
+    return own.sum() - own
 
 
 def _orthonormal(design):
