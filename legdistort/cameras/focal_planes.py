@@ -92,7 +92,7 @@ def agreed_similarity(source, target):
     """
     n = len(source)
     own = np.array([similarity.fit_similarity(a, b) for a, b in zip(source, target, strict=True)])
-    alike = _alike(own)
+    alike = similarity.alike(own, _SAME_SCALE, _SAME_ANGLE)
     number = alike.sum(axis=1)
     group = alike[np.argmax(number)]
     if np.any(number[~group] == number.max()):
@@ -110,16 +110,6 @@ def agreed_similarity(source, target):
     back = similarity.apply(similarity.invert(pose), target)
     off = np.where(agree, 0.0, np.linalg.norm(back - source, axis=2).max(axis=1))
     return Agreed(pose, agree, off, float(apart))
-
-
-def _alike(own):
-    """Which of similarities (n, 2, 3) have one parity, scale and orientation, bool (n, n)."""
-    turn = own[:, :, :2]
-    scale, parity = np.log(np.abs(np.linalg.det(turn))) / 2, np.linalg.det(turn) > 0
-    angle = np.degrees(np.arctan2(turn[:, 1, 0], turn[:, 0, 0]))
-    turned = np.abs((angle[:, None] - angle + 180) % 360 - 180)
-    same = np.abs(scale[:, None] - scale) < _SAME_SCALE
-    return same & (turned < _SAME_ANGLE) & (parity[:, None] == parity)
 
 
 def _at_one_place(shifts, middles, group):

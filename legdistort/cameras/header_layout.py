@@ -232,7 +232,7 @@ def _fitted(stated, found, rows):
 
 def _log_scales(own):
     """Logarithms (n,) of the sizes of pixels by headers over those that they have, by similarities (n, 2, 3)."""
-    return -np.log(np.abs(np.linalg.det(own[:, :, :2]))) / 2
+    return -similarity.log_scales(own)
 
 
 def _arms(corners):
@@ -252,16 +252,8 @@ def _otherwise_turned(own):
 
     Where they are is no matter of it: these shifts are not known.
     """
-    turn = own[:, :, :2]
-    parity, logs = np.linalg.det(turn) > 0, _log_scales(own)
-    angle = np.degrees(np.arctan2(turn[:, 1, 0], turn[:, 0, 0]))
-    like = [
-        (parity == parity[k])
-        & (np.abs(logs - logs[k]) < np.log(1 + SCALE_SAME))
-        & (np.abs((angle - angle[k] + 180) % 360 - 180) < ANGLE_SAME)
-        for k in range(len(own))
-    ]
-    return ~max(like, key=np.count_nonzero)
+    like = similarity.alike(own, np.log(1 + SCALE_SAME), ANGLE_SAME)
+    return ~like[np.argmax(like.sum(axis=1))]
 
 
 def _agreeing(stated, found, own):

@@ -105,6 +105,28 @@ def fit_similarity(source, target, *, weights=None, parity=None):
     return _pose(*_fit(_complex(source), _complex(target), w, parity))
 
 
+def log_scales(poses):
+    """Logarithms (n,) of the scales of similarities (n, 2, 3)."""
+    return np.log(np.abs(np.linalg.det(poses[:, :, :2]))) / 2
+
+
+def alike(poses, scale, angle):
+    """Which of similarities (n, 2, 3) have one parity, scale and orientation, bool (n, n).
+
+    Parameters
+    ----------
+    poses : ndarray, shape (n, 2, 3)
+    scale : float
+        By which logarithms of scales may differ.
+    angle : float
+        By which they may be turned against one another, degrees.
+    """
+    parity, logs = np.linalg.det(poses[:, :, :2]) > 0, log_scales(poses)
+    turn = np.degrees(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+    turned = np.abs((turn[:, None] - turn + 180) % 360 - 180)
+    return (parity[:, None] == parity) & (np.abs(logs[:, None] - logs) < scale) & (turned < angle)
+
+
 def robust_similarity(source, target, *, weights=None, n_iterations=10):
     """Similarity by iteratively reweighted least squares with Cauchy weights at the observed scale.
 

@@ -154,7 +154,7 @@ class HeaderPoses:
         middles, turns = corners.mean(axis=1), np.array([similarity.describe(step)["rotation"] for step in steps])
         turns = (turns - turns[good][0] + 180) % 360 - 180
         turns = (turns - turns[good].mean() + 180) % 360 - 180
-        errors, each = [np.nan] * 3, (middles, turns[:, None], _log_scales(steps)[:, None])
+        errors, each = [np.nan] * 3, (middles, turns[:, None], similarity.log_scales(steps)[:, None])
         if n > 1:
             errors = [np.sqrt(np.mean(np.var(values[good], axis=0, ddof=1)) / n) for values in each]
         shift, turn, scale = map(float, errors)
@@ -178,7 +178,7 @@ class HeaderPoses:
         steps = np.array([similarity.compose(similarity.invert(found[n]), self.poses[n]) for n in names])
         corners = np.array([similarity.apply(step, _grid(self.shapes[names[0]], 2)) for step in steps])
         apart = np.linalg.norm(corners - np.median(corners, axis=0), axis=2).max(axis=1)
-        good, logs = apart < TOLERANCE * self._size(names), _log_scales(steps)
+        good, logs = apart < TOLERANCE * self._size(names), similarity.log_scales(steps)
         if np.count_nonzero(good) > 2:
             off = np.abs(logs - np.median(logs[good]))
             good &= off < max(_SCALE_OFF, _MANY * 1.4826 * np.median(off[good]))
@@ -218,11 +218,6 @@ class HeaderPoses:
                 "the headers",
                 AssumptionWarning,
             )
-
-
-def _log_scales(steps):
-    """Logarithms (n,) of the scales of similarities (n, 2, 3)."""
-    return np.log(np.abs(np.linalg.det(steps[:, :, :2]))) / 2
 
 
 def _contradicting(exposures):

@@ -71,6 +71,10 @@ class Labelled:
         numbers, inverse, count = np.unique(self.star, return_inverse=True, return_counts=True)
         return (numbers[inverse] >= 0) & (count[inverse] >= least)
 
+    def n_tied(self, least):
+        """Number of detections that are of a star that so many are of."""
+        return np.count_nonzero(self.is_tied(least))
+
     def lost(self, part, least):
         """Detectors of which less than this part of what the others have is of stars in so many exposures or more."""
         if self.camera is None or len(self.camera.detectors) < 2 or len(self.names) < 2:
@@ -108,20 +112,12 @@ def labelled(table, exposures, shape, camera, options):
         found = _labelled_in(table, exposures, shape, camera, options)
         if not found.lost(_FEW, options.min_exposures):
             return found
-        begun = camera.name, camera.detectors
-    again = _set_right(table, exposures, shape, begun, options)
-    if (
-        again is not None
-        and not over
-        and np.count_nonzero(again[0].is_tied(options.min_exposures))
-        <= np.count_nonzero(found.is_tied(options.min_exposures))
-    ):
-        again = None
-    if again is None and over:
+        begun, n_tied = (camera.name, camera.detectors), found.n_tied(options.min_exposures)
+    set_right, words = _set_right(table, exposures, shape, begun, options)
+    if over and set_right is None:
         raise InputError(f"{over}, and the dithers do not tell how they lie: {detector_layout.CURE}")
-    if again is None:
+    if not over and (set_right is None or set_right.n_tied(options.min_exposures) <= n_tied):
         return _without_lost(found, options.min_exposures)
-    found, words = again
     told = "; ".join(f"detector {key} ({each})" for key, each in words.items())
     if not over and not detector_places.is_free(camera):
         raise InputError(
@@ -134,11 +130,11 @@ def labelled(table, exposures, shape, camera, options):
         f"dithers, and the night goes on; {detector_layout.CURE}",
         AssumptionWarning,
     )
-    return found
+    return set_right
 
 
 def _set_right(table, exposures, shape, begun, options):
-    """The `Labelled` detections with detectors turned as these move, and in words what was wrong; None if that is not.
+    """The `Labelled` detections with detectors turned as these move, None if that is not, and in words what was wrong.
 
     Of several ways it is that in which most stars cross from one detector to another.
     """
@@ -160,7 +156,7 @@ def _set_right(table, exposures, shape, begun, options):
             found = _labelled_in(table, exposures, shape, camera, options)
             if not found.lost(_CHANCE, options.min_exposures):
                 tried.append((found, words))
-    return max(tried, key=lambda each: each[0].n_crossing(options.min_exposures), default=None)
+    return max(tried, key=lambda each: each[0].n_crossing(options.min_exposures), default=(None, {}))
 
 
 def _without_lost(found, least):

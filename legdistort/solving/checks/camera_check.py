@@ -117,6 +117,11 @@ def _tying(solution, wrong):
     return _TIE + (_STATE_OTHER if wrong else _STATE.format(instead))
 
 
+def _undecided(solution):
+    """The cure of headers that contradict one another where nothing shows which of them are wrong."""
+    return _UNDECIDED if solution.gauge.tie is None else _UNDECIDED_TIED
+
+
 def _headers_by_group(solution):
     """The check of headers against each group of detectors that stars tie to each other, where groups are apart."""
     camera, words = solution.camera, []
@@ -125,8 +130,7 @@ def _headers_by_group(solution):
         headers = compare_headers(exact) if len(group) > 1 else None
         words += [headers.sentence("the stars have them")] if headers is not None and headers.scatter > LEAST else []
     words = [each for each in words if each]
-    cure = _UNDECIDED if solution.gauge.tie is None else _UNDECIDED_TIED
-    return Check("camera", "warn", None, None, "; ".join(words), cure) if words else None
+    return Check("camera", "warn", None, None, "; ".join(words), _undecided(solution)) if words else None
 
 
 def _headers(solution, found):
@@ -137,8 +141,7 @@ def _headers(solution, found):
     there = "the stars put it" if found else f"camera {camera.name} has it, which was given"
     if headers.is_undecided:
         there = "the stars have them" if found else f"camera {camera.name} has them, which was given"
-        cure = _UNDECIDED if solution.gauge.tie is None else _UNDECIDED_TIED
-        return Check("camera", "warn", headers.scatter, FAR, headers.sentence(there), cure)
+        return Check("camera", "warn", headers.scatter, FAR, headers.sentence(there), _undecided(solution))
     if words := headers.sentence(there):
         cure = _ODD if found else f"--layout fit tells which of the two is right; {_ODD}"
         return Check("camera", "warn", headers.far, LEAST, words, cure)
