@@ -11,7 +11,7 @@ inverse is then that of the series and a second table for what remains.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,7 +33,8 @@ TOLERANCE = 1e-6
 TABLE_TOLERANCE = 1e-3
 #: A Jacobian determinant below this counts as a fold.
 FOLD = 0.1
-_MAX_INVERSE_DEGREE = 30
+#: Largest degrees of an inverse that are tried one after another: few maps need more than the first.
+_INVERSE_DEGREES = 8, 16, 30
 #: Steps of the table of an inverse, by that of the distortion, until it is good enough.
 _FINER = 1, 1 / 2, 1 / 4, 1 / 8
 
@@ -220,27 +221,36 @@ class Distortion(ShownAsPrinted):
         self.check_fold()
         if self.table is not None:
             return self._tabulated_inverse(self.table)
-        nodes, weights = np.polynomial.legendre.leggauss(_MAX_INVERSE_DEGREE + 12)
+        errors = []
+        for largest in _INVERSE_DEGREES:
+            tensors, rest = self._projected_inverse(largest)
+            for degree in range(max(self.degree, 1), largest + 1):
+                if rest[degree] > TOLERANCE / 2:  # the largest error is no smaller than the rms of what is left out
+                    continue
+                part = tensors[:, : degree + 1, : degree + 1]
+                q = self._corrected(part, self._check_points)
+                errors.append(self._miss(q))
+                if errors[-1] <= TOLERANCE / 2:  # half, so that unchecked points stay below the promise
+                    return Inverse(part.copy(), errors[-1], _valid_box(q, self.shape))
+        raise FoldError(
+            f"no inverse of the distortion{f' of exposure {self.name}' if self.name else ''} up to degree "
+            f"{_INVERSE_DEGREES[-1]} is better than {min(errors):.1e} px ({TOLERANCE:.0e} is wanted); "
+            "the distortion is too strong or too ragged, lower the degree"
+        )
+
+    def _projected_inverse(self, degree):
+        """Tensors of the inverse up to a degree by quadrature, and the rms [pix] of what lower ones leave out."""
+        nodes, weights = np.polynomial.legendre.leggauss(degree + 12)
         u, v = np.meshgrid(nodes, nodes, indexing="ij")
         p = basis.denormalize(u.ravel(), v.ravel(), self.shape)
         shift = (self.invert(p) - p).T.reshape(2, *u.shape)
-        vander = weights[:, None] * basis.legendre(_MAX_INVERSE_DEGREE, nodes).T
-        normalised = np.einsum("ui,vj,auv->aij", vander, vander, shift, optimize=True)
-        norms = basis.norm(np.arange(_MAX_INVERSE_DEGREE + 1))
-        tensors = normalised * np.outer(norms, norms)
-        check = self._check_points
-        q = self.invert(check)
-        errors = []
-        for degree in range(max(self.degree, 1), _MAX_INVERSE_DEGREE + 1):
-            part = tensors[:, : degree + 1, : degree + 1]
-            errors.append(self.round_trip_error(part, check))
-            if errors[-1] <= TOLERANCE / 2:  # half, so that unchecked points stay below the promise
-                return Inverse(part.copy(), errors[-1], _valid_box(q, self.shape))
-        raise FoldError(
-            f"no inverse of the distortion{f' of exposure {self.name}' if self.name else ''} up to degree "
-            f"{_MAX_INVERSE_DEGREE} is better than {min(errors):.1e} px ({TOLERANCE:.0e} is wanted); "
-            "the distortion is too strong or too ragged, lower the degree"
-        )
+        vander = weights[:, None] * basis.legendre(degree, nodes).T
+        normalised = vander.T @ shift @ vander
+        n = np.arange(degree + 1)
+        by_degree = [np.sum(normalised[:, np.maximum.outer(n, n) == each] ** 2) for each in n]
+        left_out = np.sum(by_degree) - np.cumsum(by_degree)
+        norms = basis.norm(n)
+        return normalised * np.outer(norms, norms), np.sqrt(np.maximum(left_out, 0)) / 2
 
     def _tabulated_inverse(self, table):
         """The inverse of the series alone, with a table for what remains."""
@@ -280,7 +290,11 @@ class Distortion(ShownAsPrinted):
     ) -> float:
         """Largest ``|D(E(p)) - p|`` [pix] of an inverse E by its displacement tensors, and table, over check points."""
         p = self._check_points if p is None else p
-        return float(np.abs(self(self._corrected(tensors, p, table)) - p).max())
+        return self._miss(self._corrected(tensors, p, table), p)
+
+    def _miss(self, q, p=None):
+        """Largest distance in x or y [pix] of D(q) from where q should fall, the check points if not given."""
+        return float(np.abs(self(q) - (self._check_points if p is None else p)).max())
 
     def _corrected(self, tensors, p, table=None):
         """Detector pixels (n, 2) -> undistorted pixels by the displacement tensors of an inverse, and its table."""
@@ -296,7 +310,7 @@ class Distortion(ShownAsPrinted):
     def _check_certificate(self, inverse):
         p = self._check_points
         q = self._corrected(inverse.tensors, p, inverse.table)
-        error, box = np.abs(self(q) - p).max(), _valid_box(q, self.shape)
+        error, box = self._miss(q), _valid_box(q, self.shape)
         whose = f"the inverse of the distortion{f' of exposure {self.name}' if self.name else ''}"
         if not (abs(error - inverse.error) <= 1e-9 and error <= self.tolerance):
             raise InputError(
@@ -331,15 +345,18 @@ def _solve2(a, b):
     return np.stack([x, y], axis=1)
 
 
+@lru_cache(maxsize=8)
 def _check_points(shape, n):
-    """Random points, a regular grid with the edges and the corners of a detector, (n, 2) pixels."""
+    """Random points, a regular grid with the edges and the corners of a detector, (n, 2) pixels, read-only."""
     t = np.linspace(-1, 1, 33)
     grid = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
     scattered = np.random.default_rng(20170101).uniform(-1, 1, (n, 2))
     edge = np.linspace(-1, 1, 129)
     ends = np.ones_like(edge)
     sides = np.concatenate([np.stack(s, axis=1) for s in ((edge, ends), (edge, -ends), (ends, edge), (-ends, edge))])
-    return basis.denormalize(*np.concatenate([grid, scattered, sides]).T, shape)
+    out = basis.denormalize(*np.concatenate([grid, scattered, sides]).T, shape)
+    out.setflags(write=False)
+    return out
 
 
 def _valid_box(q, shape, margin=0.01):

@@ -6,6 +6,8 @@ paper's equations, which sum both axes, give the *total*, sqrt(2) times as much:
 it quotes for its simulations are per axis all the same: its slopes tend to 1, not to sqrt(2).)
 """
 
+import math
+
 import numpy as np
 
 from ..exceptions import InputError
@@ -408,7 +410,7 @@ def expected_scatter(solution, xy, sigma, *, seen=None, covariance=None):
     if callable(covariance):
         step = _AT_ONCE
     else:
-        step = max(1, _BLOCK // (2 * len(covariance) * (1 if covariance.ndim == 2 else covariance.shape[1])))
+        step = max(1, _BLOCK // (2 * math.prod(exposure_blocks(covariance, len(sigma)).shape[:2])))
     parts = [
         _expected_variance(
             solution, xy[part], sigma[:, part], None if seen is None else np.asarray(seen)[:, part], covariance

@@ -12,7 +12,7 @@ from ..geometry.tabulated.covariance_table import CovarianceTable
 from ..geometry.tabulated.displacement_table import DisplacementTable
 from ..runtime.trees.facts import array
 from .errors.camera_errors import CameraErrors
-from .errors.coefficient_covariance import exposure_block
+from .errors.coefficient_covariance import Coupled, exposure_block
 from .errors.common_maps import CommonFit
 from .gauge import UnknownDirection
 from .motions import StarMotions
@@ -93,7 +93,7 @@ class Estimate:
 class StoredUncertainty:
     """Covariances as files and pickles have them; see `legdistort.solving.equations.covariances.Uncertainty`."""
 
-    coefficients: np.ndarray = field(
+    coefficients: np.ndarray | Coupled = field(
         metadata=array(
             "n_exposures 2 n_modes",
             "n_exposures 2 n_modes",

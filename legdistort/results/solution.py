@@ -348,7 +348,7 @@ class Solution(ShownAsPrinted):
 
     @classmethod
     def read(cls, path: StrPath, *, max_bytes: int | None = None) -> Solution:
-        """Read what `write` wrote; the certificate of every inverse is checked again.
+        """Read what `write` wrote; residuals, and inverses that the file holds, are checked again.
 
         Parameters
         ----------

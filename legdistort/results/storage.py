@@ -1,11 +1,12 @@
 """Solutions as ASDF files, plain trees that any asdf reads.
 
 Files follow ASDF standard 1.5.0, which stacks of early 2025 read as well: arrays, numbers and strings under
-``legdistort``, with a schema in ``legdistort/data``. Inverses are written with their certificate, which is checked
-again when they are read.
+``legdistort``, with a schema in ``legdistort/data``. Inverses of distortions are made when they are asked for; those
+with a table, which take long, are written with their certificate, which is checked again when they are read.
 """
 
 import dataclasses
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from astropy.table import QTable
 from ..cameras import storage as cameras
 from ..cameras.camera import Camera
 from ..exceptions import FoldError, InputError
-from ..geometry import basis
+from ..geometry import basis, similarity
 from ..geometry.distortion import Inverse
 from ..geometry.tabulated.covariance_table import CovarianceTable
 from ..geometry.tabulated.displacement_table import DisplacementTable
@@ -30,7 +31,7 @@ from ..runtime.checks import LARGEST
 from ..runtime.outputs import replacing
 from ..runtime.provenance import checksums, unchanged
 from ..runtime.trees.codec import from_tree, to_tree
-from ..runtime.trees.facts import SIZE, array, number
+from ..runtime.trees.facts import array, number
 from . import nights
 from .check import Check
 from .diagnostics import Diagnostics
@@ -42,7 +43,7 @@ from .nights import NightsFound
 from .settings import Settings
 
 #: Version of the layout under ``legdistort``.
-LAYOUT = 1
+LAYOUT = 2
 #: Entry of a file under which a solution stands.
 ROOT = "legdistort"
 #: Entries by name that files of earlier versions lack.
@@ -51,6 +52,8 @@ _TABLES = {
     "static_tables": DisplacementTable,
     "table_errors": CovarianceTable,
 }
+#: Largest difference [pix] of residuals from those that follow from positions, poses and coefficients.
+_ROUNDING = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,15 +70,14 @@ class StoredFit:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class StoredExposure:
-    """One exposure; the inverse of its distortion is None where it folds."""
+class StoredExposures:
+    """The exposures, one after another in every array."""
 
-    name: str
-    shape: tuple[int, int] = dataclasses.field(metadata=SIZE)
-    pose: np.ndarray = dataclasses.field(metadata=array(2, 3, unit="pix", invertible=True))
-    coefficients: np.ndarray = dataclasses.field(metadata=array(2, "n_series", unit="pix"))
-    prior_mean: np.ndarray = dataclasses.field(metadata=array(2, "n_series", unit="pix"))
-    inverse: Inverse | None
+    name: tuple[str, ...]
+    shape: np.ndarray = dataclasses.field(metadata=array("n_exposures", 2, holds="integers", minimum=1, maximum=1e7))
+    pose: np.ndarray = dataclasses.field(metadata=array("n_exposures", 2, 3, unit="pix", invertible=True))
+    coefficients: np.ndarray = dataclasses.field(metadata=array("n_exposures", 2, "n_series", unit="pix"))
+    prior_mean: np.ndarray = dataclasses.field(metadata=array("n_exposures", 2, "n_series", unit="pix"))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -98,7 +100,8 @@ def write_solution(solution, path, *, overwrite=False):
         "degree": solution.degree,
         "chi2": float(solution.chi2),
         "dof": float(solution.dof),
-        "exposures": [to_tree(_stored_exposure(view)) for view in solution],
+        "exposures": to_tree(_stored_exposures(solution)),
+        "inverses": {name: to_tree(each) for name, each in _long_inverses(solution)},
         "stars": to_tree(StoredStars(np.asarray(estimate.star_names), estimate.positions)),
         "columns": table.colnames,  # their order: that of a mapping is lost in files
         "observations": {name: plain(table[name]) for name in table.colnames},
@@ -120,13 +123,19 @@ def write_solution(solution, path, *, overwrite=False):
     return Path(path)
 
 
-def _stored_exposure(view):
-    try:
-        inverse = view.distortion.inverse
-    except FoldError:  # such a solution is worth a look, but has no WCS
-        inverse = None
-    shape = tuple(int(n) for n in view.shape)
-    return StoredExposure(view.name, shape, view.pose, view.coefficients, view.prior_mean, inverse)
+def _stored_exposures(solution):
+    names, estimate = solution.names, solution.estimate
+    shapes = np.array([estimate.shapes[name] for name in names], dtype=int)
+    poses = np.stack([solution.poses[name] for name in names])
+    return StoredExposures(names, shapes, poses, solution.coefficients, estimate.prior_mean)
+
+
+def _long_inverses(solution):
+    """Yield names of exposures and the inverses of their distortions where these have a table."""
+    for view in solution:
+        if view.distortion.table is not None:
+            with suppress(FoldError):  # such a solution is worth a look, but has no WCS
+                yield view.name, view.distortion.inverse
 
 
 def read_solution(path, kind, *, max_bytes=None):
@@ -138,17 +147,29 @@ def read_solution(path, kind, *, max_bytes=None):
         (checksum,) = checksums(path).values()
     if not isinstance(tree, dict) or "layout" not in tree:
         raise InputError(f"{path} holds no legdistort solution (no entry 'legdistort'); give a solution.asdf")
-    check_layout(tree["layout"], LAYOUT, path)
+    check_layout(tree["layout"], (1, LAYOUT), path)
+    if tree["layout"] == 1 and isinstance(tree.get("exposures"), list):
+        tree |= understood(path, _columns, tree["exposures"])
     check_tree({"legdistort": tree}, "solution-1.0.0", path)
     return understood(path, partial(_from_tree, kind, checksum), tree)
 
 
+def _columns(exposures):
+    """Entries of this layout for the list of exposures of the first one."""
+    fields = [each.name for each in dataclasses.fields(StoredExposures)]
+    inverses = {each["name"]: each["inverse"] for each in exposures}
+    return {
+        "exposures": {name: [each[name] for each in exposures] for name in fields},
+        "inverses": {name: each for name, each in inverses.items() if each and each.get("table")},
+    }
+
+
 def _from_tree(kind, checksum, tree):
     """The solution of a tree that has the outline of one."""
-    sizes = {"n_modes": basis.n_modes(tree["degree"]), "n_exposures": len(tree["exposures"])}
+    names = tuple(tree["exposures"]["name"])
+    sizes = {"n_modes": basis.n_modes(tree["degree"]), "n_exposures": len(names)}
     fit = from_tree(StoredFit, tree, ROOT, sizes=sizes, strict=False)
-    exposures = _part(tuple[StoredExposure, ...], tree, "exposures", sizes, strict=False)
-    names = tuple(e.name for e in exposures)
+    exposures = _part(StoredExposures, tree, "exposures", sizes)
     stars = _part(StoredStars, tree, "stars", sizes, strict=False)
     motions = _part(StarMotions | None, tree, "motions", sizes)
     k = sizes.setdefault("n_terms", 0)
@@ -163,8 +184,8 @@ def _from_tree(kind, checksum, tree):
     solution = kind(
         names=names,
         degree=fit.degree,
-        poses={e.name: e.pose for e in exposures},
-        coefficients=np.stack([e.coefficients for e in exposures]),
+        poses=dict(zip(names, exposures.pose, strict=True)),
+        coefficients=exposures.coefficients,
         residuals=QTable({name: restored(tree["observations"][name]) for name in fit.columns}),
         chi2=fit.chi2,
         dof=fit.dof,
@@ -179,8 +200,8 @@ def _from_tree(kind, checksum, tree):
         estimate=Estimate(
             star_names=stars.star,
             positions=stars.position,
-            shapes={e.name: e.shape for e in exposures},
-            prior_mean=np.stack([e.prior_mean for e in exposures]),
+            shapes=dict(zip(names, map(tuple, exposures.shape.tolist()), strict=True)),
+            prior_mean=exposures.prior_mean,
             uncertainty=uncertainty,
             motions=motions,
             checked=_part(tuple[Check, ...], tree, "checks", sizes),
@@ -190,16 +211,14 @@ def _from_tree(kind, checksum, tree):
         _checksum=checksum,
     )
     _check_consistent(solution)
-    for e in exposures:
-        if e.inverse is not None:  # checks the certificate
-            known = dataclasses.replace(solution[e.name].distortion, certified=e.inverse)
-            solution.estimate.certified[e.name] = known
+    for name, inverse in _part(dict[str, Inverse], tree, "inverses", sizes).items():  # checks the certificate
+        solution.estimate.certified[name] = dataclasses.replace(solution[name].distortion, certified=inverse)
     return solution
 
 
 def _part(kind, tree, entry, sizes, *, strict=True):
     """An entry of the tree; none of it for one that files of earlier versions lack."""
-    given = tree.get(entry, [] if entry == "checks" else {} if entry in _TABLES else None)
+    given = tree.get(entry, [] if entry == "checks" else {} if entry in (*_TABLES, "inverses") else None)
     return from_tree(kind, given, f"{ROOT}.{entry}", sizes=sizes, strict=strict)
 
 
@@ -247,10 +266,36 @@ def _check_consistent(solution):
     for column, known in (("exposure", solution.names), ("star", estimate.star_names)):
         if not np.isin(np.asarray(table[column]), known).all():
             raise ValueError(f"the table of residuals names {column}s that are not in the list of them")
+    _check_residuals(solution)
     if strange := sorted(set(estimate.displacement_tables) - set(solution.names)):
         raise ValueError(f"there is a table of displacements of {strange[0]!r}, which is no exposure")
     if (tests := nights.found(solution).tests) and len(tests) != len(nights.blocks(solution)[1]):
         raise ValueError(f"there are tests of {len(tests)} nights, and {len(nights.blocks(solution)[1])} of these")
+
+
+def _check_residuals(solution):
+    """Raise if residuals do not follow from positions, poses and coefficients: of one detector, stars at rest."""
+    estimate, table = solution.estimate, solution.residuals[np.asarray(solution.residuals["used"])]
+    tables = estimate.displacement_tables or estimate.static_tables
+    if tables or estimate.motions is not None or solution.camera.has_focal_plane or not len(table):
+        return
+    found = {name: row for row, name in enumerate(solution.names)}
+    exposure = np.array([found[name] for name in np.asarray(table["exposure"]).tolist()])
+    star = np.searchsorted(estimate.star_names, np.asarray(table["star"]))
+    poses, shapes = np.stack(list(solution.poses.values())), np.array(list(estimate.shapes.values()))
+    q = similarity.apply_each(poses[exposure], estimate.positions[star])
+    ny, nx = shapes[exposure].T
+    along, across = (2 * q[:, 0] + 1) / nx - 1, (2 * q[:, 1] + 1) / ny - 1
+    b = basis.values(basis.degree_of(solution.coefficients.shape[2]), along, across)
+    p = q + np.einsum("ncm,mn->nc", solution.coefficients[exposure], b)
+    given, left = (np.stack([table[n].to_value(u.pix) for n in pair], axis=1) for pair in (("x", "y"), ("dx", "dy")))
+    wrong = ~(np.abs(given - p - left) <= _ROUNDING).all(axis=1)
+    if wrong.any():
+        name = np.asarray(table["exposure"])[wrong][0]
+        raise ValueError(
+            f"residuals of exposure {name} do not follow from its coefficients and pose and the positions of stars: "
+            "something was changed since; solve again, or take the file as it was written"
+        )
 
 
 def _check_common(gauge, uncertainty):

@@ -151,8 +151,9 @@ def check_layout(layout, known, path):
     """Raise `InputError` for a file of another layout than the one that this version knows."""
     if hasattr(layout, "shape"):
         raise InputError(f"{path} is damaged: its layout is an array, not a number")
-    if layout != known:
-        raise InputError(f"{path} has layout {layout!r}, this version reads {known}; update legdistort")
+    known = known if isinstance(known, tuple) else (known,)
+    if layout not in known:
+        raise InputError(f"{path} has layout {layout!r}, this version reads {known[-1]}; update legdistort")
 
 
 def check_tree(tree, schema, path):

@@ -411,7 +411,8 @@ def predict(
 
     Notes
     -----
-    Up to 8000 coefficients (400 exposures at degree 3) their full covariance is used; beyond, one block an exposure.
+    Up to 8000 coefficients (400 exposures at degree 3), and with few stars, their full covariance is used; else one
+    block an exposure.
     With more than 4000 stars as well, it is approximated, and an `AssumptionWarning` gives the factor.
 
     Examples

@@ -128,7 +128,7 @@ def degrees(n_exposures, n_stars):
 
 
 def survey(n_exposures, n_stars, seen):
-    """CPU time of many exposures that see a part of the stars: solution, errors, file."""
+    """CPU time [s] of many exposures that see a part of the stars: solution, errors, checks, file; size of this."""
     import tempfile
 
     from legdistort import Solution, simulate_matches, solve
@@ -148,8 +148,10 @@ def survey(n_exposures, n_stars, seen):
         solution = timed("solve", lambda: solve(sim.matches))
         timed("stars", lambda: solution.stars)
         timed("exposures", lambda: [solution[name].covariance for name in solution.names])
+        timed("checks", lambda: solution.checks)
         timed("write", lambda: solution.write(file))
         timed("read", lambda: Solution.read(file))
+        out["file [MB]"] = file.stat().st_size / 1e6
     return out
 
 
@@ -203,9 +205,9 @@ def main():
             given, chosen = degrees(n_exposures, n_stars)
             print(f"{n_exposures:9d} x {n_stars:5d} {given:13.3f} {chosen:9.2f} {chosen / given:16.1f}", flush=True)
     elif arguments.survey:
-        for n_exposures, n_stars, seen in ((600, 3000, 0.025), (2000, 10_000, 0.008)):
+        for n_exposures, n_stars, seen in ((2000, 100, 0.74), (600, 3000, 0.025), (2000, 10_000, 0.008)):
             times = survey(n_exposures, n_stars, seen)
-            cells = "  ".join(f"{name} {each:.2f} s" for name, each in times.items())
+            cells = "  ".join(f"{name} {each:.2f}" for name, each in times.items())
             print(f"{n_exposures} x {seen * n_stars:.0f} of {n_stars}: {cells}", flush=True)
     elif arguments.covariances:
         for n_exposures, n_stars in ((150, 30), (2000, 30), (400, 60), (100, 3000), (500, 2000), (500, 5000)):

@@ -31,9 +31,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 import legdistort
 from legdistort.coaddition.grids import read_grid
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortError
+from legdistort.geometry.tabulated.displacement_table import DisplacementTable
 from legdistort.matching.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.results import in_tables
+from legdistort.results.errors.coefficient_covariance import Coupled
+from legdistort.results.errors.star_covariance import star_matrix
 from legdistort.results.solution import Solution
 from legdistort.runtime import provenance
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
@@ -140,6 +143,19 @@ def test_covariances_as_blocks_survive(tmp_path, monkeypatch):
         assert_array_equal(again.stars["x_err"], solution.stars["x_err"])
 
 
+def test_covariances_coupled_through_stars_survive(tmp_path, monkeypatch):
+    """Between exposures too, so that those of stars with one another are as in memory."""
+    monkeypatch.setattr("legdistort.solving.equations.covariances.COUPLED_FROM", 100)
+    sim = simulate_matches(n_exposures=40, n_stars=25, seed=3)
+    solution = solve(sim.matches, prior=Prior(sim.truth.static))
+    assert isinstance(solution.estimate.uncertainty.coefficients, Coupled)
+    back = Solution.read(solution.write(tmp_path / "s.asdf"))
+    for field in ("own", "factor", "core"):
+        kept, given = (getattr(each.estimate.uncertainty.coefficients, field) for each in (back, solution))
+        assert_array_equal(kept, given)
+    assert_allclose(star_matrix(back), solution.estimate.uncertainty.star_matrix, rtol=1e-6, atol=1e-9)
+
+
 def test_masked_extra_columns(tmp_path):
     """Columns beyond the contract may have holes, and stay what they are: numbers, integers, text, with units."""
     given = small(
@@ -219,7 +235,7 @@ def test_the_file_is_plain(solution, tmp_path):
         assert "legdistort" not in str(file.tree["history"])
         tree = file.tree["legdistort"]
         assert set(tree["provenance"]["versions"]) >= {"legdistort", "astropy", "gwcs"}
-        assert_array_equal(tree["exposures"][1]["coefficients"], solution.coefficients[1])
+        assert_array_equal(tree["exposures"]["coefficients"], solution.coefficients)
     header = path.read_bytes().split(b"\n...")[0].decode()
     tags = {word for word in header.split() if word.startswith("!")}
     assert all(tag.startswith("!core/") for tag in tags - {"!"}), tags
@@ -302,16 +318,16 @@ def test_cut_files_are_refused(solution, tmp_path, share):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.update(layout=99), "has layout 99, this version reads 1; update legdistort"),
+        (lambda t: t.update(layout=99), "has layout 99, this version reads 2; update legdistort"),
         (lambda t: t.update(layout=np.zeros(3)), "is damaged: its layout is an array, not a number"),
         (lambda t: t.pop("gauge"), "is damaged: entry legdistort: 'gauge' is a required property$"),
         (
-            lambda t: t.update(exposures=[]),
-            r"is damaged: entry legdistort\.exposures: \[\] .*; it should be a list of ex",
+            lambda t: t["exposures"].update(name=[]),
+            r"entry legdistort\.exposures\.name: \[\] .*; it should be a list of exposures, at least one",
         ),
         (
             lambda t: t.update(exposures=[1]),
-            r"entry legdistort\.exposures\[0\]: 1 is not of type 'object'; it should be",
+            r"entry legdistort\.exposures: \[1\] is not of type 'object'; it should be what there is of the exposures",
         ),
         (
             lambda t: t.update(degree="three"),
@@ -341,7 +357,7 @@ def test_cut_files_are_refused(solution, tmp_path, share):
         (lambda t: t["covariance"].update(stars=[1, 2]), r"entry legdistort\.covariance\.stars: shape .2,.; it should"),
         (lambda t: t["gauge"].update(box=np.zeros(4)), r"gauge.box: shape \(4,\); it should be \(2, 2\)$"),
         (lambda t: t["gauge"].update(kind="none"), "gauge.kind: 'none'; it should be one of minimal, mean, sh"),
-        (lambda t: t["exposures"][0].update(coefficients=np.zeros((2, 4))), "is damaged"),
+        (lambda t: t["exposures"].update(coefficients=np.zeros((4, 2, 4))), "is damaged"),
         (
             lambda t: t["covariance"]["common"].update(stars=np.ones((15, 2, 6))),
             r"covariance\.common\.stars: covariances larger than the variances allow",
@@ -349,17 +365,20 @@ def test_cut_files_are_refused(solution, tmp_path, share):
         (lambda t: t["stars"].update(position=np.full((15, 2), np.nan)), "a star without a position has observations"),
         (lambda t: t["observations"]["dx"]["values"].__setitem__(3, 1e300), "'dx' should hold finite numbers of pix"),
         (
-            lambda t: t["exposures"][0].update(shape=[300, -5]),
-            r"shape\[1\]: -5; it should be finite, a number from 1 to 1e\+07 .pix.",
+            lambda t: t["exposures"]["shape"].__setitem__((0, 1), -5),
+            r"shape\[0, 1\]: -5; it should be finite, numbers from 1 to 1e\+07",
         ),
         (
-            lambda t: t["exposures"][0].update(name="../../x"),
+            lambda t: t["exposures"]["name"].__setitem__(0, "../../x"),
             "does not match .*should be the name of an exposure, which",
         ),
-        (lambda t: t["exposures"][0].update(name=t["exposures"][1]["name"]), "two exposures have the same name"),
         (
-            lambda t: t["exposures"][0].update(pose=np.ones((2, 3))),
-            r"exposures\[0\]\.pose: a map that has no inverse; it should be one that has",
+            lambda t: t["exposures"]["name"].__setitem__(0, t["exposures"]["name"][1]),
+            "two exposures have the same name",
+        ),
+        (
+            lambda t: t["exposures"]["pose"].__setitem__(2, np.ones((2, 3))),
+            r"exposures\.pose\[2\]: a map that has no inverse; it should be one that has",
         ),
         (lambda t: t.update(sky={"lon": 0, "lat": 99, "matrix": np.eye(2, 3)}), r"entry legdistort\.sky"),
         (lambda t: t.update(left_out=3), "entry legdistort.left_out: 3 is not of type 'object'; it should be reasons"),
@@ -417,7 +436,9 @@ def saved_tree(solution, path):
 def test_a_folded_solution_can_be_written(solution, tmp_path):
     coefficients = solution.coefficients.copy()
     coefficients[0, 0, 3] = 500
-    folded = replace(solution, coefficients=coefficients)
+    table = solution.residuals.copy()
+    table["used"][table["exposure"] == solution.names[0]] = False
+    folded = replace(solution, coefficients=coefficients, residuals=table)
     back = Solution.read(folded.write(tmp_path / "s.asdf"))
     with pytest.raises(LegdistortError, match="folds"):
         _ = back[back.names[0]].wcs
@@ -430,28 +451,46 @@ def test_a_folded_solution_can_be_written(solution, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda e: e["coefficients"].__setitem__((0, 4), e["coefficients"][0, 4] + 1e-5), "misses by .* was certified"),
-        (
-            lambda e: e["inverse"]["tensors"].__setitem__((1, 0, 0), 0.3),
-            "misses by .* px where .* coefficients or inver",
-        ),
-        (lambda e: e["inverse"].update(error_px=1e-7), "misses by .* where 1e-07 px was certified"),
-        (
-            lambda e: e["inverse"].update(error_px=0.5),
-            r"exposures\[1\]\.inverse\.error_px: 0.5; it should be finite, a number from 0 to 0.001 .pix.$",
-        ),
-        (lambda e: e["inverse"].update(valid_undistorted_px=[-1e6, 1e6, -1e6, 1e6]), "is stated to be valid in"),
-        (lambda e: e.update(shape=[300, 501]), "misses by"),
+        (lambda t: np.add.at(t["exposures"]["coefficients"], (1, 0, 4), 1e-5), "of exposure exp01 do not follow"),
+        (lambda t: t["exposures"]["pose"].__setitem__((1, 0, 2), 3.0), "of exposure exp01 do not follow"),
+        (lambda t: t["exposures"]["shape"].__setitem__((1, 1), 501), "of exposure exp01 do not follow"),
+        (lambda t: t["stars"]["position"].__setitem__((0, 0), 7.0), "of exposure exp00 do not follow"),
+        (lambda t: t["observations"]["x"]["values"].__setitem__(0, 7.0), "of exposure exp00 do not follow"),
     ],
 )
 def test_changed_coefficients_are_noticed(solution, tmp_path, change, message):
     tree = saved_tree(solution, tmp_path / "s.asdf")
-    tree["exposures"][1]["coefficients"] = np.array(tree["exposures"][1]["coefficients"])
-    tree["exposures"][1]["inverse"]["tensors"] = np.array(tree["exposures"][1]["inverse"]["tensors"])
-    change(tree["exposures"][1])
+    change(tree)
     asdf.AsdfFile({"legdistort": tree}, version="1.5.0").write_to(tmp_path / "s.asdf")
     with pytest.raises(InputError, match=r"s\.asdf.*" + message):
         Solution.read(tmp_path / "s.asdf")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda e: e["tensors"].__setitem__((1, 0, 0), 0.3), "misses by .* px where .* coefficients or inver"),
+        (lambda e: e.update(error_px=1e-7), "misses by .* where 1e-07 px was certified"),
+        (
+            lambda e: e.update(error_px=0.5),
+            r"inverses\.exp01\.error_px: 0.5; it should be finite, a number from 0 to 0.001 .pix.$",
+        ),
+        (lambda e: e.update(valid_undistorted_px=[-1e6, 1e6, -1e6, 1e6]), "is stated to be valid in"),
+    ],
+)
+def test_changed_inverses_are_noticed(solution, tmp_path, change, message):
+    """Those of distortions with a table, which files keep."""
+    table = DisplacementTable(np.zeros((2, 3, 3)), (0.0, 0.0), (256.0, 256.0))
+    tree = saved_tree(_with_table(solution, table), tmp_path / "s.asdf")
+    assert list(tree["inverses"]) == ["exp01"]
+    change(tree["inverses"]["exp01"])
+    asdf.AsdfFile({"legdistort": tree}, version="1.5.0").write_to(tmp_path / "s.asdf")
+    with pytest.raises(InputError, match=r"s\.asdf.*" + message):
+        Solution.read(tmp_path / "s.asdf")
+
+
+def _with_table(solution, table):
+    return replace(solution, estimate=replace(solution.estimate, displacement_tables={"exp01": table}, certified={}))
 
 
 def test_the_inverse_that_was_certified_is_the_one_used(solution, tmp_path):

@@ -14,7 +14,14 @@ from legdistort import Matches, solve
 from legdistort.exceptions import AssumptionWarning, SolveError
 from legdistort.geometry.detector_modes import similarity_basis
 from legdistort.priors.prior import Prior
-from legdistort.results.errors.coefficient_covariance import exposure_blocks
+from legdistort.results.errors.coefficient_covariance import (
+    Coupled,
+    exposure_block,
+    exposure_blocks,
+    mean_covariance,
+    times,
+    with_shared,
+)
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving import start_values
 from legdistort.solving.equations import covariances, criterion, elimination, reduced_system
@@ -282,6 +289,30 @@ def test_errors_of_one_star_that_some_exposures_have_not_seen(case, in_blocks):
     found = Uncertainty(problem, blocks, gauge, coefficients=coefficients)
     both = [star, star + M]
     close(found.covariance_between(np.array([star]), 2), found.star_matrix[np.ix_(both, both)])
+
+
+def test_many_exposures_are_coupled_through_the_stars(case, monkeypatch):
+    """The covariance of all coefficients without an array as large: as exact as that array."""
+    problem, state, blocks, _ = case
+    gauge = constraints.make("minimal", problem, state, blocks)
+    dense = Uncertainty(problem, blocks, gauge, scale=1.5)
+    whole, of_stars, unknowns = dense.coefficients, dense.star_matrix, dense.star_unknowns
+    for name, value in (("DENSE_LIMIT", 10), ("COUPLED_FROM", 10)):
+        monkeypatch.setattr(covariances, name, value)
+    monkeypatch.setattr(reduced_system, "DIRECT_LIMIT", 10)  # which would serve as well
+    found = Uncertainty(problem, blocks, gauge, scale=1.5)
+    assert isinstance(found.coefficients, Coupled)
+    responses = np.random.default_rng(3).normal(size=(N, 2 * K, 4))
+    coupled = found.coefficients
+    for _ in range(2):
+        close(exposure_blocks(coupled, N), exposure_blocks(whole, N))
+        close(np.stack([exposure_block(coupled, N, i) for i in range(N)]), exposure_blocks(whole, N))
+        close(times(coupled, np.eye(2 * N * K)), whole)
+        close(mean_covariance(coupled, N), mean_covariance(whole, N))
+        whole, coupled = (with_shared(each, responses) for each in (whole, coupled))
+    again = Uncertainty(problem, blocks, gauge, scale=1.5, coefficients=found.coefficients)
+    close(again.star_unknowns, unknowns)
+    close(again.star_matrix, of_stars)
 
 
 def test_star_errors_need_no_covariance_of_the_coefficients(case):

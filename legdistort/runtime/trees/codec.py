@@ -187,8 +187,12 @@ class _Reader:
         _check_numbers(array, facts, where)
         if facts.covariance or facts.packed:
             _check_covariance(array, facts, where)
-        if facts.invertible and not abs(np.linalg.det(array[:, :2])) > _FLAT * np.sum(array[:, :2] ** 2):
-            _refuse(where, "a map that has no inverse", "one that has")
+        if facts.invertible:
+            linear = array[..., :2]
+            flat = ~(np.abs(np.linalg.det(linear)) > _FLAT * np.sum(linear**2, axis=(-2, -1)))
+            if flat.any():
+                at = f"[{int(np.argmax(flat))}]" if flat.ndim else ""
+                _refuse(where + at, "a map that has no inverse", "one that has")
         return array
 
     def _has_shape(self, expected, found):

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 #: Beyond this many coefficients the dense covariance is replaced by its diagonal blocks.
 DENSE_LIMIT = 8000
+#: Coefficients from which on they are coupled through the stars where that is less, and numbers of that at most.
+COUPLED_FROM, _MOST_COUPLED = 2000, 5e7
 #: Stars whose errors by approximated blocks are compared with exact ones.
 _N_CHECKED = 50
 
@@ -75,11 +77,15 @@ class Uncertainty:
         """Covariance of the fitted coefficients, shape (n_exposures * 2 n_modes,) squared, px^2; x modes first.
 
         A camera is taken as known.
-        Beyond `DENSE_LIMIT` one block an exposure, shape (n_exposures, 2 n_modes, 2 n_modes):
-        `legdistort.results.errors.coefficient_covariance` reads both.
+        Beyond `COUPLED_FROM`, of few stars, `Coupled` through these, and beyond `DENSE_LIMIT` else one block an
+        exposure, shape (n_exposures, 2 n_modes, 2 n_modes): `legdistort.results.errors.coefficient_covariance` reads
+        all.
         """
         if self._given is not None:
             return self._given
+        if self._is_coupled:
+            coupled = self._on_stars.coupled()
+            return replace(coupled, own=self._scale**2 * coupled.own, core=self._scale**2 * coupled.core)
         if self._is_dense:
             return self._scale**2 * self._direct.covariance()
         if self._on_stars is not None:
@@ -107,8 +113,14 @@ class Uncertainty:
     @property
     def _is_dense(self):
         if self._given is not None:
-            return self._given.ndim == 2
+            return isinstance(self._given, np.ndarray) and self._given.ndim == 2
         return self._problem.n_exposures * 2 * self._problem.n_modes <= DENSE_LIMIT
+
+    @property
+    def _is_coupled(self):
+        """Whether there are many coefficients, and few stars through which they are coupled."""
+        n = self._problem.n_exposures * 2 * self._problem.n_modes
+        return n > COUPLED_FROM and self._on_stars is not None and self._on_stars.coupling_size <= _MOST_COUPLED
 
     @cached_property
     def _on_stars(self):

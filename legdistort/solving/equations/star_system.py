@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, lu_factor, lu_solve
 from scipy.linalg.lapack import dgecon, dgetri
 
+from ...results.errors.coefficient_covariance import Coupled
 from . import elimination
 from .reduced_base import Reduced
 from .star_terms import packed, unpacked
@@ -162,6 +163,19 @@ class OnStars(Reduced):
         n = self._determined.size
         known = self._determined.ravel()
         return (self._inverse_matrix[:n, :n] * known * known[:, None]).reshape(2 * self._determined.shape)
+
+    @property
+    def coupling_size(self):
+        """Numbers of the factor of `coupled`."""
+        return self.unknowns.size * len(self._unit)
+
+    def coupled(self):
+        """`Coupled` covariance of the coefficients in the gauge, through the stars and the constraints."""
+        n_exposures, k = self._roots.shape[:2]
+        out = np.zeros((n_exposures, k, len(self._unit)))
+        for i, (on, factor) in enumerate(self._factors()):
+            out[i][:, on] = self._roots[i] @ factor.T
+        return Coupled(self._roots @ self._roots.mT, out.reshape(n_exposures * k, -1), self._inverse_matrix)
 
     def covariance_blocks(self):
         """Covariance of the coefficients of every exposure in the gauge, shape (n_exposures, 2 n_modes, 2 n_modes)."""

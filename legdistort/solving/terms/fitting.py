@@ -22,6 +22,7 @@ from scipy.optimize import minimize_scalar
 from ...exceptions import ConvergenceWarning, SolveError, warn
 from ...results.diagnostics import FittedTerm
 from ...results.errors.camera_errors import CameraErrors, unit_errors
+from ...results.errors.coefficient_covariance import with_shared
 from ..equations.common_parts import followed, relative_responses, response
 from ..equations.elimination import inverse_star_blocks
 from ..equations.star_terms import unpacked
@@ -127,10 +128,7 @@ def forecast(terms, fit):
         return with_errors(fit, field, errors), errors
     numbers = _Numbers.of(terms, fit, {}, np.zeros_like(fit.problem.xy))
     made = _with_errors(fit, numbers.step(fit, np.zeros(len(numbers.keys))), numbers)
-    known, added = fit.uncertainty.coefficients, made.camera_errors.coefficients
-    if known.ndim == 2:
-        added = added.reshape(-1, added.shape[2])
-    return made, known + added @ added.mT
+    return made, with_shared(fit.uncertainty.coefficients, made.camera_errors.coefficients)
 
 
 def _check_alone(terms):
