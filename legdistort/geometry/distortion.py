@@ -248,9 +248,9 @@ class Distortion(ShownAsPrinted):
         normalised = vander.T @ shift @ vander
         n = np.arange(degree + 1)
         by_degree = [np.sum(normalised[:, np.maximum.outer(n, n) == each] ** 2) for each in n]
-        left_out = np.sum(by_degree) - np.cumsum(by_degree)
+        left_out = np.append(np.cumsum(by_degree[:0:-1])[::-1], 0.0)
         norms = basis.norm(n)
-        return normalised * np.outer(norms, norms), np.sqrt(np.maximum(left_out, 0)) / 2
+        return normalised * np.outer(norms, norms), np.sqrt(left_out) / 2
 
     def _tabulated_inverse(self, table):
         """The inverse of the series alone, with a table for what remains."""
