@@ -356,7 +356,7 @@ def _plan(known, path, target, *, kind, max_error, ext, overwrite):
         if kind == "head":
             whole = _head(hdulist, of_images)
         elif images:
-            edits += _foreign_edits(known, images, spans, raw, path) or _asdf_edits(
+            edits += _foreign_edits(known, images, spans, raw, path, headers[next(iter(images))]) or _asdf_edits(
                 known, images, spans, *_tables(known, hdulist, spans, path, overwrite)
             )
     return _Plan(path, target, zlib.crc32(raw), headers, edits, elsewhere, whole)
@@ -384,7 +384,7 @@ def _plan_of_tree(known, path, target, raw, kind):
     return _Plan(path, target, zlib.crc32(raw), {name: None}, [], [], whole)
 
 
-def _foreign_edits(known, images, spans, raw, path):
+def _foreign_edits(known, images, spans, raw, path, header):
     """The edit of the only extension ASDF of a file, if it is a data model of a pipeline with a gwcs; else none."""
     tables = [span for span in spans if span.header.get("EXTNAME") == "ASDF"]
     if len(images) != 1 or len(tables) != 1 or "EXPNAME" in tables[0].header or tables[0].header.get("TFIELDS") != 1:
@@ -395,7 +395,7 @@ def _foreign_edits(known, images, spans, raw, path):
         found = model_wcs(content, label)
     if found is None:
         return []
-    whole = refined_tree(content, found, known.views[name], label)
+    whole = refined_tree(content, found, known.views[name], label, header, WCS_KEYWORDS)
     known.moved[name] = corner_move(found[1], known.views[name])[0]
     return [(span.start, span.stop, table_of(span.header, whole))]
 

@@ -1,8 +1,9 @@
 """Another gwcs in an ASDF file of somebody else's, in which every other key, tag and block stays as it is.
 
-But for the footprint that pipelines keep beside the WCS, ``wcsinfo.s_region``, which becomes that of the new one. The
-texts are exchanged within the YAML of the file; what stands before and after them, and the arrays that follow, are not
-read as objects, which would take the packages that wrote them.
+But for what pipelines keep beside the WCS in ``wcsinfo``: the footprint ``s_region``, which becomes that of the new
+one, and copies of cards, which data models write over those of the header when they are saved next. Texts are exchanged
+within the YAML of the file; what stands before and after them, and the arrays that follow, are not read as objects,
+which would take the packages that wrote them.
 """
 
 import io
@@ -23,7 +24,7 @@ from .refinement import refine
 _END = re.compile(rb"\n\.\.\.\r?\n")
 _INDEX = b"#ASDF BLOCK INDEX"
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_FOOTPRINT = "wcsinfo", "s_region"  # beside the WCS
+_BESIDE, _FOOTPRINT = "wcsinfo", "s_region"  # beside the WCS
 _HANDLE = "%TAG ! tag:stsci.edu:asdf/"
 #: Names of repeated parts, which asdf counts from one in every file.
 _ANCHOR = re.compile(r"(?<=[\s,\[{])([&*])id(\d+)\b")
@@ -44,7 +45,7 @@ def model_wcs(content, label):
     return wcs_in(tree)
 
 
-def refined_tree(content, found, view, label):
+def refined_tree(content, found, view, label, header=None, obsolete=None):
     """The bytes of an ASDF file in which the WCS of an image is that of a solution, see `legdistort.refine`.
 
     Parameters
@@ -56,6 +57,8 @@ def refined_tree(content, found, view, label):
     view : View
     label : str
         How messages call it.
+    header, obsolete : `~astropy.io.fits.Header` and pattern, optional
+        Cards of the WCS in the header of the image, and which others no longer belong there: copies in the tree follow.
 
     Raises
     ------
@@ -64,7 +67,17 @@ def refined_tree(content, found, view, label):
     """
     keys, wcs, _ = found
     content = _exchanged(content, keys, refine(wcs, view).stock(), label)
-    return _with_text(content, (*keys[:-1], *_FOOTPRINT), lambda text: renewed_region(text, wcs, view))
+
+    def renewed(key, text):
+        if key == _FOOTPRINT:
+            region = renewed_region(text, wcs, view)
+            return text if region is None else region
+        card = key.upper()
+        if header is None or not obsolete.fullmatch(card):
+            return text
+        return yaml.safe_dump(header.get(card)).splitlines()[0]
+
+    return _with_texts(content, (*keys[:-1], _BESIDE), renewed)
 
 
 def table_of(header, content):
@@ -102,17 +115,18 @@ def _exchanged(content, keys, wcs, label):
     return out + _moved(rest, len(out) - len(content) + len(rest))
 
 
-def _with_text(content, keys, renewed):
-    """The bytes of an ASDF file in which the text at nested keys, if there is one, is another; None leaves it."""
+def _with_texts(content, keys, renewed):
+    """The bytes of an ASDF file in which ``renewed(key, text)`` stands for texts in the mapping at nested keys."""
     end = _END.search(content)
     text, rest = content[: end.end()].decode("utf-8"), content[end.end() :]
     node = _node(text, keys)
-    new = renewed(node.value) if isinstance(node, yaml.ScalarNode) else None
-    if new is None:
-        return content
-    first, last = _span(text, keys)
-    out = f"{text[:first]}{new}{text[last:]}".encode()
-    return out + _moved(rest, len(out) - end.end())
+    out = text
+    for name, value in reversed(node.value if isinstance(node, yaml.MappingNode) else ()):
+        if isinstance(value, yaml.ScalarNode) and (new := renewed(name.value, value.value)) != value.value:
+            first, last = _places(text, value)
+            out = out[:first] + new + out[last:]
+    raw = out.encode()
+    return content if out == text else raw + _moved(rest, len(raw) - end.end())
 
 
 def _node(text, keys):
@@ -126,7 +140,11 @@ def _node(text, keys):
 
 def _span(text, keys):
     """Where the value of nested keys begins and ends in a YAML text."""
-    node = _node(text, keys)
+    return _places(text, _node(text, keys))
+
+
+def _places(text, node):
+    """Where a node begins and ends in the text that it was composed of."""
     starts = np.cumsum([0, *map(len, text.splitlines(keepends=True))])
     return tuple(int(starts[mark.line]) + mark.column for mark in (node.start_mark, node.end_mark))
 

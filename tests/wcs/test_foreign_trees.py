@@ -7,6 +7,8 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import QTable, Table
+from astropy.wcs import WCS
+from astropy.wcs.utils import fit_wcs_from_points
 from numpy.testing import assert_allclose, assert_array_equal
 
 import legdistort as ld
@@ -138,6 +140,31 @@ def test_data_models_of_jwst(night, tmp_path):
     again = after
     attach(solution, path, in_place=True, kind=None)
     assert len(path.read_bytes()) == len(again)
+
+
+@pytest.mark.slow
+def test_copies_of_cards_in_data_models_follow(night, tmp_path):
+    """Saved next by the pipeline's own package, they would be written over those of the header."""
+    datamodels = pytest.importorskip("stdatamodels.jwst.datamodels")
+    paths, solution = night
+    path, tree = tmp_path / f"{solution.names[0]}.fits", model_of(paths[0])
+    pixels = np.random.default_rng(1).uniform(20, 200, (2, 50))
+    with datamodels.ImageModel(np.array(tree["data"], dtype="f4")) as model:
+        model.meta.wcs = tree["meta"]["wcs"]
+        former = fit_wcs_from_points(pixels, SkyCoord(*tree["meta"]["wcs"](*pixels), unit="deg")).to_header()
+        copies = {key.lower(): former[key] for key in former if key[:5] in ("CRPIX", "CRVAL", "CTYPE", "CDELT")}
+        copies |= {f"pc{i}_{j}": former.get(f"PC{i}_{j}", float(i == j)) for i in (1, 2) for j in (1, 2)}
+        for key, value in (copies | {"v2_ref": 120.5, "vparity": -1}).items():
+            setattr(model.meta.wcsinfo, key, value)
+        model.save(path)
+    (done,) = attach(solution, path, out=tmp_path / "out", kind="sip")
+    with datamodels.ImageModel(done.path) as model:
+        assert (model.meta.wcsinfo.v2_ref, model.meta.wcsinfo.vparity) == (120.5, -1)
+        model.save(tmp_path / "again.fits")
+    for each in (done.path, tmp_path / "again.fits"):
+        found = WCS(fits.getheader(each, "SCI")).all_pix2world(*pixels, 0)
+        off = np.abs(np.subtract(found, solution[solution.names[0]].wcs(*pixels))).max()
+        assert off * 3600e3 < 1, f"{off * 3600e3} mas"
 
 
 @pytest.mark.slow
