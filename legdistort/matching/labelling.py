@@ -20,6 +20,7 @@ from ..inputs.exposures import stated_numbers
 from ..measurement.flags import Flag, flags_of
 from ..runtime import parallel
 from .detectors import detector_layout, detector_places
+from .detectors.foreign_images import foreign_images
 from .exposure_groups import interlink, link, standing, unite, without
 from .fields import apart
 from .header_poses import HeaderPoses
@@ -111,7 +112,7 @@ def labelled(table, exposures, shape, camera, options):
             table = with_ids_of(table, camera.detectors)
         found = _labelled_in(table, exposures, shape, camera, options)
         if not found.lost(_FEW, options.min_exposures):
-            return found
+            return _without_lost(found, options.min_exposures)
         begun, n_tied = (camera.name, camera.detectors), found.n_tied(options.min_exposures)
     set_right, words = _set_right(table, exposures, shape, begun, options)
     if over and set_right is None:
@@ -160,13 +161,25 @@ def _set_right(table, exposures, shape, begun, options):
 
 
 def _without_lost(found, least):
-    """The detections without those of detectors of which so few are tied as chance ties, with a warning."""
+    """The detections without those of detectors, or images, of which so few are tied as chance ties, with a warning."""
     if lost := found.lost(_CHANCE, least):
         ids = found.camera.ids(found.table)
         found.star[np.isin(ids, lost)] = -1
         warn(
             f"hardly a detection of detector{'s' * (len(lost) > 1)} {', '.join(lost)} fits those of the others, and "
             f"the dithers do not tell why: nothing of it is used; {detector_layout.CURE}",
+            AssumptionWarning,
+        )
+    if found.camera is None or not found.camera.has_focal_plane or len(found.names) < 2:
+        return found
+    foreign = foreign_images(found.camera, found.table, found.star, found.is_tied(least))
+    if foreign:
+        images = zip(found.table["exposure"], found.camera.ids(found.table), strict=True)
+        found.star[[image in foreign for image in images]] = -1
+        told = [f"{key} of {name} ({n} of {seen})" for (name, key), (n, seen) in foreign.items()]
+        warn(
+            f"hardly a detection where other exposures looked is a star of theirs, of detector {', '.join(told)}: "
+            "nothing of it is used; is it the list of another field, exposure or detector?",
             AssumptionWarning,
         )
     return found
