@@ -399,7 +399,7 @@ def _judged(source, target, warp, limit, tolerance):
     nearest = target.tree.query(predicted, distance_upper_bound=limit)
     strength = _strength(predicted, target.tree, nearest, limit, len(warp.coefficients))
     possible = np.mean(target.on_detector(predicted)) * min(len(source), len(target))
-    if strength < MIN_STRENGTH or len(i) < max(5, MIN_SHARE * possible):
+    if strength < MIN_STRENGTH or not possible or len(i) < max(5, MIN_SHARE * possible):  # none may fall on the image
         return None
     return Registration(i, j, distance, warp, float(limit), float(strength), len(i) / possible)
 
