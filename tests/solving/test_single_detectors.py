@@ -124,7 +124,7 @@ def test_bad_words(gsaoi):
     for given, words in (
         ({"dynamic": "chip"}, "dynamic must be"),
         ({"dynamic": "detector", "layout": "fit"}, "has a pose of its own: leave layout out"),
-        ({"dynamic": "detector", "prior": legdistort.Prior(np.zeros((2, 10)))}, "to the camera"),
+        ({"dynamic": "detector", "prior": legdistort.Prior(np.zeros((2, 10)))}, "leave prior and its sizes out"),
         ({"dynamic": "detector", "static": "free"}, "static must be"),
         ({"exposure_degree": 1}, "leave exposure_degree out, or take every detector by itself"),
         ({"exposure_degree": 1, "static": "fit"}, "leave exposure_degree out, or take every detector by itself"),
