@@ -333,9 +333,9 @@ def _of_detectors(matches, prior, layout, static, dynamic, degree):
         )
     if prior is not None:
         raise InputError(
-            "with dynamic='detector' (--dynamic detector) every detector of every exposure has a distortion of its own: "
-            "leave prior and its sizes out (--prior, --prior-sigma, --static-sigma); what is known of detectors the "
-            "camera has (Detector(..., static=))"
+            "with dynamic='detector' (--dynamic detector) every detector of every exposure has a distortion of its "
+            "own: leave prior and its sizes out (--prior, --prior-sigma, --static-sigma); what is known of detectors "
+            "the camera has (Detector(..., static=))"
         )
     return *by_detector(matches, static), "fit" if static == "fit" else None
 
