@@ -105,6 +105,7 @@ def pointing_off(night, solution):
     return np.mean((found - true) * [np.cos(np.radians(-20.0)), 1], axis=0) * 3600 / header_layouts.ARCSEC
 
 
+@pytest.mark.slow
 def test_the_pointing_of_the_next_visit_is_that_of_its_headers(night, first):
     """What a reference corrected of the first visit's, whose headers are off by 5 px more, is no part of the camera."""
     assert np.abs(pointing_off(night, first)).max() < 0.02

@@ -585,7 +585,7 @@ def test_an_exposure_that_bends_more_than_others_does_not_contradict_them():
         pytest.param(0.3, 20.0, False, marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.parametrize("compiled_from", [0, 20_000])
+@pytest.mark.parametrize("compiled_from", [pytest.param(0, marks=pytest.mark.slow), 20_000])
 def test_a_plain_fit_leads_to_the_same_observations_as_robust_start_values(
     share, size, serves, compiled_from, monkeypatch
 ):
