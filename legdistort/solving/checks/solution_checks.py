@@ -20,7 +20,7 @@ from ...results.gauge import warning_of
 from ..terms.observed import Observed
 from .camera_check import camera_check, contradicted_layout, undetermined
 from .cures import camera_first, header_first, with_cost, with_cures
-from .dynamic_check import EVIDENCE, dynamic_check, mirrored_check, nights_check, significance
+from .dynamic_check import EVIDENCE, dynamic_check, has_static_of_degree, mirrored_check, nights_check, significance
 from .extrapolated_maps import extrapolation_check
 from .limits import MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
@@ -355,9 +355,9 @@ def degree_check(solution, residuals, *, shows_static):
                      f"--degree {more}, or --degree auto")  # fmt: skip
     p = significance(solution, top_only=True)
     if solution.degree > 1 and p > 0.05 and not solution.diagnostics.prior_has_widths:
+        lower = "" if has_static_of_degree(solution) else f"--degree {solution.degree - 1}, or "
         return Check("degree", "warn", score.rms, error,
-                     f"no exposure has modes of degree {solution.degree} beyond noise",
-                     f"--degree {solution.degree - 1}, or {EVIDENCE}")  # fmt: skip
+                     f"no exposure has modes of degree {solution.degree} beyond noise", lower + EVIDENCE)  # fmt: skip
     found = f"degree {more} would explain nothing more{little}"
     if not shows_static:
         found += " of what changes between exposures; what they have in common would go into the stars"
