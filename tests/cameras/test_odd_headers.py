@@ -14,6 +14,7 @@ from legdistort.cameras import header_layout
 from legdistort.exceptions import AssumptionWarning, FoldError, LegdistortWarning, SolveError
 from legdistort.reporting.summary import summarise
 from legdistort.solving import camera_fit
+from legdistort.solving.checks import solution_checks
 
 SIZE, STEP = 640, 680
 ODD = 35.0, -28.0, 0.8
@@ -278,6 +279,12 @@ def test_it_has_none_where_the_camera_is_given(night, tmp_path):
     check = next(check for check in solution.checks if check.name == "camera")
     assert check.state == "warn"
     assert "from where camera four has it, which was given" in check.sentence
+    pointing = replace(solution.diagnostics.pointing, detectors={"3": 45.0})
+    both = replace(solution, diagnostics=replace(solution.diagnostics, pointing=pointing))
+    beside = solution_checks.pointing_check(both, check).sentence
+    assert "how headers have the detectors to each other with how the given layouts have them, this one where" in beside
+    assert beside.endswith("of the first --layout fit tells, of the sky nothing but a reference tells (--reference)")
+    assert "check camera" not in solution_checks.pointing_check(both, replace(check, state="pass")).sentence
     again = ld.Solution.read(solution.write(tmp_path / "solution.asdf"))
     assert again.camera.headers.odd == ("3",)
 
