@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from astropy import units as u
-from scipy import special
+from scipy import linalg, special
 
 from ..cameras.camera import Camera
 from ..cameras.detector import map_alone, maps_of_plane, widths_alone
@@ -14,7 +14,7 @@ from ..geometry import basis, detector_modes
 from ..geometry.distortion import Distortion
 from ..matching.matches import Matches
 from ..priors.prior import Prior
-from ..results.errors.common_distortion import NOTHING, common_distortion
+from ..results.errors.common_distortion import NOTHING, common_distortion, scatter_of_mean
 from ..results.solution import Solution
 from ..solving import single_fit
 from ..solving.equations.reduced_system import DIRECT_LIMIT
@@ -34,6 +34,7 @@ KEPT = 6.0
 _ROUNDS = 3
 _KEPT = "loss", "motion", "motion_sigma", "motion_epoch", "night_sigma"  # settings of a night
 _MOST = 500  # coefficients from which the scatter of exposures is found
+_FEWEST = 1  # degrees of freedom of a scatter
 _LARGER = 1.1  # sizes, by which a derivative is taken
 
 
@@ -60,8 +61,6 @@ class KnownMap:
         Modes beyond are not known.
     is_named : bool
         Whether it is a map of one detector that its file names.
-    common : ndarray, shape (2, n), or None
-        The distortion of the focal plane of a camera, of all exposures, that is a part of the maps.
     """
 
     label: str
@@ -71,7 +70,6 @@ class KnownMap:
     dof: float = np.inf
     degree: int | None = None
     is_named: bool = False
-    common: np.ndarray | None = None
 
     @property
     def highest(self):
@@ -79,17 +77,30 @@ class KnownMap:
         return max(basis.degree_of(each.shape[1]) for each in self.statics.values())
 
 
+def follows(thing):
+    """Whether what a solution, nights, a camera or a prior know is reckoned from a map that they are compared with.
+
+    One detector of which a night shows little is near that, and detectors in a focal plane are after a common map of
+    the plane, which their exposures take over where no reference told it.
+    """
+    if isinstance(thing, Solution):
+        return not thing.camera.has_focal_plane or thing.gauge.tie is None
+    if isinstance(thing, Camera):
+        return thing.common_map is None and _n_found(thing) > 0
+    return not isinstance(thing, Prior) and thing.has_focal_plane  # nights
+
+
 def known_map(thing, label, other=None):
     """What a solution, nights, a camera or a prior know; the `other` is that of what it is compared with."""
     if isinstance(thing, Solution):
         if thing.camera.has_focal_plane:
-            return _of_focal_plane(thing, label)
+            return _of_focal_plane(thing, label, other)
         return _of_night(thing, label, next(iter(other.statics.values())) if other else None)
     if isinstance(thing, Camera):
-        return _of_camera(thing, label, other and other.common)
+        return _of_camera(thing, label, other)
     if not isinstance(thing, Prior):
         if thing.has_focal_plane:
-            return _of_camera(thing.camera(), label, other and other.common, thing.static(further_night=True)[1])
+            return _of_camera(thing.camera(), label, other, thing.static(further_night=True)[1])
         return _of_nights(thing, label)
     covariance = _stated(thing)
     named = thing.source.get("detector") if isinstance(thing.source, dict) else None
@@ -111,20 +122,19 @@ def _of_nights(nights, label):
     return KnownMap(nights.name if label.startswith("the ") else label, {"1": static}, {"1": nights.shape}, covariance)
 
 
-def _of_camera(camera, label, common=None, covariance=None):
+def _of_camera(camera, label, other=None, covariance=None):
     """The detectors of a camera, the shear of whose layouts is a part of their maps; perhaps with a joint covariance.
 
     One that was found from exposures knows nothing of a map that all its detectors share, which these took over, unless
-    a reference told it: it is taken as the `common` one (2, n) of what it is compared with.
+    a reference told it: it is that after which they are nearest to the `other` map.
     """
-    statics = {key: map_alone(each)[1] for key, each in camera.detectors.items()}
-    n, sigma = _n_found(camera), NOTHING
-    if camera.common_map is not None:
-        n = camera.common_map.shape[1]
-        common, sigma = camera.common_map, np.minimum(camera.common_sigma.ravel(), NOTHING)
-    if n and common is not None:
-        plane = Distortion(common[:, :n], camera.field)
-        statics = {key: map_alone(each, plane)[1] for key, each in camera.detectors.items()}
+    n, common = _n_found(camera), camera.common_map
+    sigma = NOTHING
+    if common is not None:
+        n, sigma = common.shape[1], np.minimum(camera.common_sigma.ravel(), NOTHING)
+    elif n and other is not None:
+        common = _nearest(camera, n, other)
+    statics = _statics(camera, common)
     shapes = {key: each.shape for key, each in camera.detectors.items()}
     widths, joint = [each.static_sigma for each in camera.detectors.values()], covariance
     if not camera.has_focal_plane:
@@ -145,6 +155,35 @@ def _of_camera(camera, label, common=None, covariance=None):
     return KnownMap(camera.name if label.startswith("the ") else label, statics, shapes, covariance)
 
 
+def _statics(camera, common):
+    """Coefficients of the detectors of a camera after a map of its focal plane, modes (2, n), or None."""
+    plane = None if common is None else Distortion(common, camera.field)
+    return {key: map_alone(each, plane)[1] for key, each in camera.detectors.items()}
+
+
+def _nearest(camera, n, other):
+    """The map of a focal plane, modes (2, n), after which the detectors of a camera are nearest to another `KnownMap`.
+
+    As `legdistort.assessment.nights.camera_changes` brings the cameras of nights to one: what two have otherwise by a
+    map that nothing tells may be large, and is not linear.
+    """
+    common, both = np.zeros((2, n)), [key for key in camera.detectors if key in other.statics]
+    rows = {key: detector_modes.dynamic_basis(camera[key].shape, n) for key in both}
+    to_rows = [rows[key] @ maps_of_plane(camera[key], camera.field, n) for key in both]
+    for _ in range(_ROUNDS * bool(both)):
+        statics = _statics(camera, common)
+        away = [
+            rows[key] @ np.subtract(*(_pointed(each[key], camera[key].shape, n) for each in (other.statics, statics)))
+            for key in both
+        ]
+        common = common + np.linalg.lstsq(np.vstack(to_rows), np.concatenate(away))[0].reshape(2, n)
+    return common
+
+
+def _pointed(static, shape, n):
+    return basis.change_degree(detector_modes.pointed(static, shape), basis.degree_of(n)).ravel()
+
+
 def _n_found(camera):
     """Number of modes (per axis) of the static distortions that were found from exposures; 0 for another camera."""
     sigmas = [each.static_sigma for each in camera.detectors.values() if each.layout_covariance is not None]
@@ -154,7 +193,7 @@ def _n_found(camera):
     return next(n for n in map(basis.n_modes, range(1, basis.MAX_DEGREE + 1)) if n > highest) if highest else 0
 
 
-def _of_focal_plane(solution, label):
+def _of_focal_plane(solution, label, other):
     """The detectors of a camera that was fitted, with what its exposures have in common.
 
     Of layouts that were held nothing is known, nor of what nothing determined of those that were fitted.
@@ -165,24 +204,43 @@ def _of_focal_plane(solution, label):
             f"{label} was solved with the static distortions of camera {camera.name} as given, and says nothing of "
             "them: solve it with static='fit' (--static fit)"
         )
-    known = _of_camera(camera, label)
     n = int(np.flatnonzero(errors.free.any(axis=(0, 1))).max()) + 1  # what is beyond was given, and not asked
     free = errors.free[:, :, :n]
-    common = np.concatenate([maps_of_plane(each, camera.field, n) for each in camera.detectors.values()])
+    maps = np.concatenate([maps_of_plane(each, camera.field, n) for each in camera.detectors.values()])
     mean, covariance, shared = common_distortion(solution, n)
-    moved = common @ shared
+    common = mean.reshape(2, n)
+    if solution.gauge.tie is None and other is not None:
+        common = _nearest(camera, n, other)
+    moved = maps @ shared
     moved[free.ravel()] += errors.changes
     unseen = ~free
     unseen[:, :, :3] |= [np.isinf(each.layout_sigma) if each.layout_sigma is not None else np.ones((2, 3), dtype=bool)
                          for each in camera.detectors.values()]  # fmt: skip
-    covariance = common @ covariance @ common.T + moved @ moved.T + np.diag(NOTHING**2 * unseen.ravel())
-    degree, common = basis.degree_of(n), mean.reshape(2, n)
-    plane = Distortion(common, camera.field)
-    statics = {
-        key: detector_modes.pointed(map_alone(each, plane)[1], each.shape) for key, each in camera.detectors.items()
-    }
+    covariance = maps @ covariance @ maps.T + moved @ moved.T + np.diag(NOTHING**2 * unseen.ravel())
+    shapes = {key: each.shape for key, each in camera.detectors.items()}
+    statics = {key: detector_modes.pointed(each, shapes[key]) for key, each in _statics(camera, common).items()}
+    degree = basis.degree_of(n)
     statics = {key: basis.change_degree(each, degree) for key, each in statics.items()}
-    return replace(known, statics=statics, covariance=covariance, degree=degree, common=common)
+    name = camera.name if label.startswith("the ") else label
+    dof = _freedom_by_scatter(solution, covariance, maps, shapes.values())
+    return KnownMap(name, statics, shapes, covariance, dof, degree)
+
+
+def _freedom_by_scatter(solution, covariance, maps, shapes):
+    """Degrees of freedom of the covariance of detectors, which rests on how exposures scatter about a common map.
+
+    Those by which the scatter tells its determinant, in the directions that count; infinite if it is no part of it.
+    """
+    scattered, n = scatter_of_mean(solution), maps.shape[1] // 2
+    if scattered is None or solution.gauge.tie is None:
+        return np.inf
+    rows = linalg.block_diag(*[detector_modes.dynamic_basis(each, n) for each in shapes])
+    power, directions = np.linalg.eigh(rows @ covariance @ rows.T)
+    counted = (power < 1 / DETERMINED) & (power > 0)
+    to_plane = directions[:, counted].T @ rows @ maps @ np.kron(np.eye(2), np.eye(n, basis.n_modes(solution.degree)))
+    shares = [np.sum(to_plane @ part * to_plane / power[counted, None]) for part, _ in scattered]
+    freedom = np.array([max(each, _FEWEST) for _, each in scattered])
+    return _joint_freedom(np.array(shares) / max(np.count_nonzero(counted), 1), freedom)
 
 
 def _of_night(solution, label, other):
@@ -325,7 +383,7 @@ def _shown(fit, number=None):
     larger = whole.sizes * (1 + (_LARGER - 1) * np.eye(n_sizes, len(whole.sizes)))
     share = certain(whole) - np.array([certain(replace(whole, sizes=each)) for each in larger])
     share /= 2 * np.log(_LARGER)
-    dof = float(1 / np.sum(share**2 / np.maximum(_freedom(found)[:n_sizes], 1) + 1e-12))
+    dof = _joint_freedom(share, np.maximum(_freedom(found)[:n_sizes], _FEWEST))
     if number is not None:
         information, pull = np.pad(information, (0, 2 * k - len(pull))), np.pad(pull, (0, 2 * k - len(pull)))
         per = np.repeat([1.0, unit], k)
@@ -346,6 +404,14 @@ def _sizes_of(model):
         if found is None or found.cost - likely.cost > KEPT:
             found = likely
     return found
+
+
+def _joint_freedom(share, freedom):
+    """Degrees of freedom of a covariance, from shares of squared sizes in the logarithm of its determinant and theirs.
+
+    Shares are those a direction.
+    """
+    return float(1 / np.sum(share**2 / freedom + 1e-12))
 
 
 def _freedom(posterior):

@@ -25,7 +25,7 @@ from ..results.solution import Solution
 from ..runtime.asdf_files import entry_of
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
-from .known_maps import DETERMINED, MEAN_SQUARE, chance, known_map
+from .known_maps import DETERMINED, MEAN_SQUARE, chance, follows, known_map
 from .nights.camera_memory import CombinedNights
 from .nights.night_data import numbers_in
 from .star_difference import StarDifference, compare_stars, shared_exposures
@@ -225,8 +225,8 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
     are in both, as of a solution with and without a night, errors are not independent, and no probability is given.
 
     A map of a file that names its detector is compared with that detector of a camera, and two gwcs that end in other
-    frames on the sky. What the detectors of a camera share counts where a reference tied the night, since exposures can
-    take it over; not beside a camera that was itself found from exposures.
+    frames on the sky. What the detectors of a camera share counts where a reference tied the night, to what exposures
+    scatter about it by; else these can take it over, and the map of the plane that brings it nearest is taken off.
 
     Parameters
     ----------
@@ -286,9 +286,12 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
 def _of_maps(one, two):
     """The `MapDifference` of what was opened, as of independent data."""
     one, two = _at_number(one, two), _at_number(two, one)
-    alone = not isinstance(two[0], Solution) or (isinstance(one[0], Camera) and two[0].camera.has_focal_plane)
-    one = known_map(*one, known_map(*two) if alone else None)
-    two = known_map(*two, one)
+    if follows(one[0]) and not follows(two[0]):
+        two = known_map(*two)
+        one = known_map(*one, two)
+    else:
+        one = known_map(*one)
+        two = known_map(*two, one)
     if one.label == two.label:
         one, two = replace(one, label=f"{one.label} (first)"), replace(two, label=f"{two.label} (second)")
     pairs = _paired(one, two)

@@ -1,7 +1,7 @@
 """Cameras by the world coordinate systems of the detectors of one exposure: FITS WCSs and gwcs.
 
 Every WCS leads to the sky. Seen from one tangent point in their middle the detectors lie in one plane, that of the
-focus. Its pixels have the mean size of those of the detectors, and its axes their mean direction, so that nothing of
+focus. Its pixels have the median size of those of the detectors, and its axes their mean direction, so that nothing of
 where the telescope pointed is left but the side of the sky that is up.
 """
 
@@ -144,7 +144,7 @@ def _expanded(exposure, centre):
 def _focal_plane(poses):
     """Similarity from the focal plane to the tangent plane, in which the detectors lie as upright as they can."""
     turned = np.mean([pose[:, :2] / np.sqrt(abs(np.linalg.det(pose[:, :2]))) for pose in poses], axis=0)
-    scale = np.mean([similarity.describe(pose)["scale"] for pose in poses])
+    scale = np.median([similarity.describe(pose)["scale"] for pose in poses])  # one that is wrong has no part in it
     parity = 1 if np.sum([np.sign(np.linalg.det(pose[:, :2])) for pose in poses]) >= 0 else -1
     pose = similarity.similarity_of(np.zeros(2), np.zeros(2), turned, parity)
     pose[:, :2] *= scale / similarity.describe(pose)["scale"]

@@ -5,7 +5,7 @@ is the one of the detectors that agree on it, so that a detector whose header is
 wrong that has its detector elsewhere, turned, mirrored, or its pixels of another size than the others have theirs.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -24,6 +24,8 @@ FAR = 20.0
 CHANCE = 4e-3
 #: Pixels of two detectors are of the same size by headers to this: distortions make up for so much.
 _SAME_SCALE = 1.01
+#: The size of one differs from those of the others if it does by so many times their rms.
+_MANY = 5
 #: By less than this [deg, part] no detector is otherwise turned, or larger, for dithers: `legdistort.solve` finds that.
 ANGLE_SAME, SCALE_SAME = 3.0, 0.03
 #: A mirrored detector is not turned if it is by less than this [deg].
@@ -90,6 +92,12 @@ class HeaderLayout:
         """Sizes of pixels by the headers over what they are, (n,); those that agree have 1 on average."""
         logs = _log_scales(self.own)
         return np.exp(logs - logs[self.agree].mean())
+
+    @property
+    def scale_error(self):
+        """Least error of the scale of the headers' plane, relative, by how those that agree have sizes of pixels."""
+        logs = _log_scales(self.own)[self.agree]
+        return float(np.std(logs, ddof=1) / np.sqrt(len(logs))) if len(logs) > 1 else 0.0
 
     @cached_property
     def errors(self):
@@ -186,6 +194,37 @@ def _told_error(error):
     return f" +- {error:.1g}" if np.isfinite(error) else ""
 
 
+def with_usual_scales(detectors):
+    """Detectors as headers have them, ``{id: Detector}``, with pixels of the usual size where one has another.
+
+    If the others agree, and it differs by 1 to 3 per cent: dithers tell more, and less a distortion makes up for. A
+    common map of the focal plane makes up for any, so that exposures alone do not tell it from a header that is wrong.
+
+    Returns
+    -------
+    detectors : dict
+    odd : dict
+        ``{id: ratio}`` of the size of its pixels to that of the others, by headers.
+    """
+    logs = _log_scales(np.array([each.layout for each in detectors.values()]))
+    away, out, odd = logs - np.median(logs), dict(detectors), {}
+    wrong = _stands_out(logs) & (np.abs(away) < np.log(1 + SCALE_SAME))
+    for key, off in ((key, off) for key, off, is_odd in zip(detectors, away, wrong, strict=True) if is_odd):
+        middle, step = basis.denormalize(*np.zeros((2, 1)), detectors[key].shape)[0], np.exp(off) * np.eye(2)
+        scaled = similarity.compose(np.column_stack([step, middle - step @ middle]), detectors[key].layout)
+        out[key], odd[key] = replace(detectors[key], layout=scaled), float(np.exp(off))
+    return out, odd
+
+
+def _stands_out(logs):
+    """Logarithms of sizes of pixels (n,) that differ from those of the others, which are most and agree, bool (n,)."""
+    away = np.abs(logs - np.median(logs))
+    wrong = away > np.log(_SAME_SCALE)
+    if len(logs) < 3 or 2 * np.count_nonzero(wrong) >= len(logs):
+        return np.zeros(len(logs), dtype=bool)
+    return wrong & (away > _MANY * np.sqrt(np.mean(away[~wrong] ** 2)))
+
+
 def compare_headers(detectors):
     """The `HeaderLayout` of a camera; None if headers state nothing of it, or it has no place for two detectors.
 
@@ -252,7 +291,7 @@ def _otherwise_turned(own):
 
     Where they are is no matter of it: these shifts are not known.
     """
-    like = similarity.alike(own, np.log(1 + SCALE_SAME), ANGLE_SAME)
+    like = similarity.alike(own, np.log(_SAME_SCALE), ANGLE_SAME)
     return ~like[np.argmax(like.sum(axis=1))]
 
 
@@ -265,7 +304,7 @@ def _agreeing(stated, found, own):
     if n == 2:
         return np.ones(2, dtype=bool)
     parity, logs = np.linalg.det(own[:, :, :2]) > 0, _log_scales(own)
-    alike = parity == (2 * np.count_nonzero(parity) >= n)
+    alike = (parity == (2 * np.count_nonzero(parity) >= n)) & ~_stands_out(logs)
     rows, arm = np.flatnonzero(alike), _arms(found)
     if len(rows) > 2:
         scale = _like_most(len(rows), lambda some: (arm * (logs - logs[rows[some]].mean()))[rows] ** 2, n_values=1)

@@ -102,6 +102,26 @@ def largest_by_bend(camera, degree):
     return np.max(found, axis=0)
 
 
+def bend_in_words(camera, degree):
+    """By how much a map of all detectors together, to a degree, has them elsewhere; empty of an affine one."""
+    if degree < 2:
+        return ""
+    shift, turn = largest_by_bend(camera, degree)
+    return (
+        f"a bend of all together by 1 px rms, which a reference would tell (--reference), shifts single ones by up to "
+        f"{shift:.2g} px and turns them by up to {turn:.2g} deg"
+    )
+
+
+def relative_in_words(degree):
+    """That errors of a layout are after a map of all detectors, to a degree, in words."""
+    which = "one affine map" if degree < 2 else f"one map of degree {degree}"
+    return (
+        f"errors of the layout are those of detectors relative to each other, after {which} of all together, which "
+        "exposures take over"
+    )
+
+
 def _independent(camera):
     """Covariance of the layouts with the `common_map`, as if the errors of both had nothing in common."""
     known = np.where(np.isfinite(camera.common_sigma), camera.common_sigma, 0.0)

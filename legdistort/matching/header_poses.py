@@ -158,6 +158,7 @@ class HeaderPoses:
         if n > 1:
             errors = [np.sqrt(np.mean(np.var(values[good], axis=0, ddof=1)) / n) for values in each]
         shift, turn, scale = map(float, errors)
+        scale = max(scale, np.radians(turn))  # a header that has the one wrong does not know the other better
         if self.apart > 0:
             shift = float(np.hypot(np.nan_to_num(shift), self.apart))
         apart = np.linalg.norm(corners - np.median(corners, axis=0), axis=2).max(axis=1)
@@ -299,8 +300,14 @@ def similarity_of(layout):
 
 
 def pointing_by_layout(pointing, found):
-    """A `HeaderPointing` with what headers disagree by of a found layout, if nothing shows which of them are wrong."""
-    apart = 0.0 if found is None or pointing is None else similarity_of(found)[1]
+    """A `HeaderPointing` with what headers disagree by of a found layout, if nothing shows which of them are wrong.
+
+    And with an error of the scale by how sizes of pixels differ from theirs, those of most alike.
+    """
+    if found is None or pointing is None:
+        return pointing
+    pointing = replace(pointing, scale=float(np.fmax(pointing.scale, found.scale_error)))
+    apart = similarity_of(found)[1]
     if not apart > 0 or pointing.apart > 0 or pointing.detectors:
         return pointing
     return replace(pointing, apart=apart, shift=float(np.hypot(np.nan_to_num(pointing.shift), apart)))

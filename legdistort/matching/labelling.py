@@ -104,7 +104,7 @@ def labelled(table, exposures, shape, camera, options):
         begun = detector_layout.stated_layout(parts)
     else:
         if camera is None and parts:
-            camera = Camera.of_frames(parts)
+            camera = detector_layout.with_usual_scales(Camera.of_frames(parts))
             log.info("layout of the detectors by the headers, from which solve begins to find it: %s", camera)
         elif parts:
             camera = camera.with_headers(parts)

@@ -355,22 +355,16 @@ def layout_errors(solution):
     known = solution.settings.prior
     if places.exchanges_a_bend(camera) and solution.gauge.tie is None and known and known.get("source") == UNSTATED:
         degree = max(degree, solution.degree)  # nothing is known of what exposures scatter about
-    which = "one affine map" if degree < 2 else f"one map of degree {degree}"
     unknown = f", and {solution.gauge.unknown_in_words}" if solution.gauge.unknown_names else ""
     bend = ""
     if camera.place_errors is not None and places.exchanges_a_bend(camera):
         bend = "; a bend of all together, as the reference tells it, is in places and errors"
-    elif degree > 1:
-        shift, turn = places.largest_by_bend(camera, degree)
-        bend = (
-            f"; a bend of all together by 1 px rms, which a reference would tell (--reference), shifts single ones by "
-            f"up to {shift:.2g} px and turns them by up to {turn:.2g} deg"
-        )
+    elif words := places.bend_in_words(camera, degree):
+        bend = f"; {words}"
     unsettled = "; the fit did not settle, and these errors do not hold" * bool(errors.unsettled)
     return (
-        f"errors of the layout are those of detectors relative to each other, after {which} of all together, which "
-        f"exposures take over{unknown} (not determined): places and rotations in the focal plane are not known so well"
-        f"{bend}{unsettled}"
+        f"{places.relative_in_words(degree)}{unknown} (not determined): places and rotations in the focal plane are "
+        f"not known so well{bend}{unsettled}"
     )
 
 

@@ -384,8 +384,9 @@ def _of_exposure(solution, name):
     try:
         return solution[name]
     except InputError as error:
-        by = "its file by legdistort nights SOLUTION --out camera.asdf, then legdistort correct camera.asdf LIST"
-        by = "solution.camera.correct_table(list)" if solution.camera.has_focal_plane else by
+        several = solution.camera.has_focal_plane
+        by = f"its file by legdistort {'camera' if several else 'nights'} SOLUTION --out camera.asdf, then legdistort "
+        by += "correct camera.asdf LIST" + " (in Python solution.camera.correct_table(list))" * several
         raise InputError(
             f"{error}; positions of other exposures are corrected for the static distortion alone, by a camera: {by}"
         ) from None

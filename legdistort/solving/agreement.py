@@ -9,6 +9,7 @@ import functools
 import numpy as np
 from astropy import units as u
 
+from ..cameras.stated_errors import undetermined_degree
 from ..exceptions import AssumptionWarning, MatchError, SolveError, by_reason, some_of, warn
 from ..geometry import pair_agreement
 from ..geometry.star_hull import enclosed_area
@@ -144,7 +145,14 @@ def _undetermined(matches, name):
 def warn_of_lost_exposures(fit, matches):
     """Warn of exposures left out: of each, but of those of a night that has another distortion together."""
     new = {n: why for n, why in fit.matches.left_out.items() if n not in matches.left_out or UNDETERMINED in why}
+    degree, found = fit.problem.degree, undetermined_degree(matches.camera)
     for reason, names in by_reason(new).items():
+        if found > degree and UNFOLLOWED in reason:
+            reason += (
+                f"; but exposures of degree {degree} cannot take over what camera {matches.camera.name}, found with "
+                f"degree {found}, has of a map that all share, so that one that is turned or shifted far may be right: "
+                f"degree={found} (--degree {found}) first"
+            )
         if ALIKE in reason and len(names) > 1:
             warn(f"{len(names)} exposures are left out ({some_of(names, MOST_NAMED)}): {reason}", AssumptionWarning)
         else:

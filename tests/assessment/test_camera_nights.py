@@ -311,6 +311,8 @@ def test_a_night_is_compared_with_the_camera_of_others(tmp_path):
     nights = campaign(1, 4, nightly=0.02)
     combined = ld.combine_nights(nights[:3])
     combined.write(tmp_path / "camera.asdf")
+    words = " ".join(str(combined).split())
+    assert words.startswith("Camera PAIR: static distortion of degree 2 from 18 exposures of 3 nights.")
     assert ld.difference(tmp_path / "camera.asdf", nights[3]).agrees
     assert ld.difference(combined, nights[0]).shared == nights[0].names
     one, other = (ld.difference(each, nights[3]) for each in (combined, combined.camera()))
@@ -331,6 +333,11 @@ def test_coefficients_of_all_detectors_are_drawn(monkeypatch):
         nights.append(replace(night, information=information, pull=np.zeros(36)))
     sizes = {"scatter": np.full(3, 0.05), "oddness": np.ones(3)}
     found = ld.CombinedNights(tuple(nights), shape=(SIZE, SIZE), name="ROW", **sizes)
+    words = " ".join(str(found).split())
+    assert "relative to each other, after one map of degree 2 of all together, which exposures take over (not" in words
+    assert "what a reference told of that map in a night is no part of this camera, but of that which" in words
+    assert "a bend of all together by 1 px rms, which a reference would tell (--reference), shifts single ones" in words
+    assert str(replace(found, name="camera")).startswith("Camera: static distortion of degree 2 from ")
     fig = found.plot()
     assert len(fig.axes) == 2 * 2 * 6
     assert fig.axes[-6].get_ylabel() == "detector 2\nalong y [pix]"

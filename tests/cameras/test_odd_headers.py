@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 import legdistort as ld
+from legdistort.cameras import header_layout
 from legdistort.exceptions import AssumptionWarning, FoldError, LegdistortWarning, SolveError
 from legdistort.reporting.summary import summarise
 from legdistort.solving import camera_fit
+from legdistort.solving.checks import solution_checks
 
 SIZE, STEP = 640, 680
 ODD = 35.0, -28.0, 0.8
@@ -111,6 +113,64 @@ def test_scales_that_differ_all_over_the_field_contradict_nothing():
     for key, scale in (("1", 1.005), ("2", 1.005), ("3", 1.01)):
         made = spoilt(made, key, scale * np.eye(2))
     assert made.headers.odd == ()
+
+
+def spread(layout, factor):
+    """The layout with pixels of another size, about the middle of its detector."""
+    middle = np.full(2, (SIZE - 1) / 2)
+    return np.column_stack([factor * layout[:, :2], factor * (layout[:, 2] - middle) + middle])
+
+
+def stated(scales):
+    """Detectors in a row where headers have them, with pixels of these sizes."""
+    made = {}
+    for k, scale in enumerate(scales):
+        layout = np.column_stack([np.eye(2), np.full(2, (SIZE - 1) / 2) - [k * STEP, 0]])
+        made[f"{k}"] = ld.Detector((SIZE, SIZE), layout=spread(layout, 1 / scale), layout_sigma=np.inf)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("scales", "odd"),
+    [
+        ((1, 1.02, 1, 1), {"1": 1.02}),
+        ((1, 1, 0.985), {"2": 0.985}),
+        ((1.006, 0.995, 1.02, 1), {}),  # a distortion of the field, perhaps
+        ((1, 1.05, 1, 1), {}),  # dithers tell that
+        ((1, 1.02), {}),
+        ((1, 1, 1.02, 1.02), {}),
+    ],
+)
+def test_pixels_of_another_size_are_those_of_the_others_to_begin_with(scales, odd):
+    """About the middle of the detector, which stays where the header has it."""
+    before = stated(scales)
+    after, found = header_layout.with_usual_scales(before)
+    assert found == pytest.approx(odd)
+    middle = np.full((1, 2), (SIZE - 1) / 2)
+    for key, each in after.items():
+        np.testing.assert_allclose(each.to_focal_plane(middle), before[key].to_focal_plane(middle), atol=1e-9)
+        size = np.sqrt(np.linalg.det(each.layout[:, :2]) / np.linalg.det(before[key].layout[:, :2]))
+        assert size == pytest.approx(odd.get(key, 1))
+
+
+@pytest.mark.slow
+def test_one_header_of_pixels_of_another_size_has_no_part_in_the_scale_of_the_sky():
+    """By 2 %: the scale was 0.31 % off, with no word on it, since a bend of all detectors together hides which is."""
+    night = header_layouts.Night(3, off=0.5, n=7, n_stars=260, own=0.3, static=0.3, rolls=(0, 0, 0, 30, 90))
+    for each in night.exposures:
+        if each.detector == "3":
+            middle, wcs = np.full((1, 2), (header_layouts.SIZE - 1) / 2), each.wcs
+            wcs.wcs.crpix = middle[0] + 1 + (wcs.wcs.crpix - middle[0] - 1) / 1.02
+            wcs.wcs.cd = wcs.wcs.cd * 1.02
+    with pytest.warns(AssumptionWarning, match=r"detector 3 1.020 times as large as .*--layout-sigma of solve"):
+        matches = ld.match(night.table, exposures=night.exposures)
+    solution = ld.solve(matches, static="fit")
+    right = night.sky[night.true_stars(solution)] * [-1, 1] * header_layouts.ARCSEC / 3600
+    found = np.column_stack([solution.stars["ra"].value * np.cos(np.radians(-20.0)), solution.stars["dec"].value])
+    z, w = ((each - each.mean(axis=0)) @ [1, 1j] for each in (right, found))
+    assert abs(np.vdot(z, w) / np.vdot(z, z)) == pytest.approx(1, abs=1.5e-3)
+    told = float(re.search(r"error of its scale, which is ([\d.e-]+) of it at\s+least", str(solution))[1])
+    assert np.radians(0.01) < told < 3e-3
 
 
 @pytest.mark.parametrize(
@@ -219,6 +279,12 @@ def test_it_has_none_where_the_camera_is_given(night, tmp_path):
     check = next(check for check in solution.checks if check.name == "camera")
     assert check.state == "warn"
     assert "from where camera four has it, which was given" in check.sentence
+    pointing = replace(solution.diagnostics.pointing, detectors={"3": 45.0})
+    both = replace(solution, diagnostics=replace(solution.diagnostics, pointing=pointing))
+    beside = solution_checks.pointing_check(both, check).sentence
+    assert "how headers have the detectors to each other with how the given layouts have them, this one where" in beside
+    assert beside.endswith("of the first --layout fit tells, of the sky nothing but a reference tells (--reference)")
+    assert "check camera" not in solution_checks.pointing_check(both, replace(check, state="pass")).sentence
     again = ld.Solution.read(solution.write(tmp_path / "solution.asdf"))
     assert again.camera.headers.odd == ("3",)
 

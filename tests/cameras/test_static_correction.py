@@ -13,6 +13,7 @@ import legdistort as ld
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, FoldError, InputError
 from legdistort.geometry.tabulated.displacement_table import DisplacementTable
+from legdistort.results import new_positions
 
 SHAPE = (900, 1200)
 #: Orders in x and y of the modes up to degree 3.
@@ -329,6 +330,20 @@ def test_what_is_refused(words, said, folder, capsys, monkeypatch, tmp_path):
     assert main(["correct", *words.split(), "--out", str(tmp_path / "out.ecsv")]) == 1
     assert said in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_camera_of_several_detectors_corrects_exposures_that_are_not_in_a_solution():
+    """The command that writes its file, and the one that corrects, as for one detector."""
+
+    class Solved:
+        camera = pair()
+
+        def __getitem__(self, name):
+            raise InputError(f"no exposure {name} in the solution")
+
+    words = r"no exposure e9 .*its file by legdistort camera SOLUTION --out camera.asdf, then legdistort correct cam"
+    with pytest.raises(InputError, match=words):
+        list(new_positions._parts(Solved(), Table({"exposure": ["e9"]})))
 
 
 # -- one detector of a camera whose focal plane has a map that a reference told

@@ -138,13 +138,14 @@ def test_where_no_majority_agrees_the_groups_are_named():
 
 
 def test_what_absolute_errors_leave_out_of_a_sky_by_headers():
-    """Pointing and rotation, at least by their scatter, and the scale, in which headers of one instrument have none."""
+    """Pointing and rotation, at least by their scatter, and the scale, which is known no better than the rotation."""
     words = HeaderPointing(5, 0.5, 0.01).error(0.02)
     assert words.startswith(
         "by their scatter the error of its pointing is 10 mas per axis at least, of its rotation 0."
     )
     assert "what they all have wrong alike (guide stars, roll) adds to that and is not known" in words
     assert words.endswith("leave this out, and the error of its scale, which is as they state it")
+    assert HeaderPointing(5, 0.5, 0.01, scale=2e-4).error(0.02).endswith("scale, which is 0.0002 of it at least")
     by_camera = HeaderPointing(5, 0.5, 0.01).error(0.02, "NIRCAM")
     assert "scale, which is by a reference of camera NIRCAM, as is the rotation but for by how much" in by_camera
     known = HeaderPointing(5, 0.5, 0.01).error(0.02, "NIRCAM", (2e-5, 0.0012))

@@ -12,6 +12,7 @@ import four_detectors
 import known_displacements
 import numpy as np
 import pytest
+from astropy.table import Table
 
 import legdistort as ld
 from legdistort.exceptions import LegdistortWarning
@@ -180,3 +181,24 @@ def test_what_a_higher_degree_costs_is_said_where_it_gains_little(ratio, told):
     assert ("errors of positions grow" in after["chi2"].sentence) is told
     assert {name: after[name] for name in ("brightness", "degree")} == {n: made[n] for n in ("brightness", "degree")}
     assert after["chi2"].cure == made["chi2"].cure
+
+
+@pytest.mark.slow
+def test_a_degree_that_detectors_have_is_not_to_be_lowered():
+    """A lower one sent back here: exposures of it do not take over what detectors of this one share."""
+    given = four_detectors.matches("static", 2, n=6, n_stars=160)
+    rng = np.random.default_rng(2)  # as the set draws its stars
+    stars, noise = rng.uniform(-400, 2 * (four_detectors.SIZE + four_detectors.GAP) + 340, (160, 2)), 0.05
+    rows = np.arange(0, 160, 4)
+    xy = stars[rows] + noise * rng.normal(size=(40, 2))
+    known = Table({"star": rows.astype(str), "x": xy[:, 0], "y": xy[:, 1]})
+    known["x_err"] = known["y_err"] = noise
+    with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        night = ld.solve(given, static="fit", layout="fit", degree=2, reference=known)
+        table = night.camera.on_detectors(given.table)
+        matches = ld.Matches.from_table(table, camera=night.camera, poses=given.poses)
+        wrong = checks_of(ld.solve(matches, degree=2))["degree"]
+        cured = checks_of(ld.solve(matches, degree=2, prior=ld.Prior(None, sigma="evidence")))["degree"]
+    assert wrong.sentence == "no exposure has modes of degree 2 beyond noise"
+    assert wrong.cure.startswith("--prior-sigma evidence, ")
+    assert cured.state == "pass"

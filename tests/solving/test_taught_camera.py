@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from astropy.table import Table
 from numpy.testing import assert_allclose
 
 import legdistort as ld
-from legdistort.exceptions import InputError, LegdistortWarning
+from legdistort.exceptions import AssumptionWarning, InputError, LegdistortWarning
+from legdistort.solving import agreement
 
 SIZE, GAP = 512, 30
 STEP = SIZE + GAP
@@ -188,3 +190,16 @@ def test_the_degree_of_the_camera_is_the_first_cure_where_that_of_the_exposures_
     caplog.clear()
     enough = ld.solve(matches)
     assert "was found with degree" not in caplog.text + " ".join(check.sentence for check in enough.checks)
+
+
+def test_an_exposure_that_the_degree_may_have_put_aside_is_said_to_be_one():
+    """Of the camera of another night, with what all exposures share up to degree 3 not determined."""
+    taught = ld.Camera("FOUR", dict(camera().detectors), common_sigma=np.full((2, 10), np.inf))
+    why = "163 of its 249 stars deviate from the solution of the others (mismatched, or not this field?)"
+    left = {"e6": why}
+    given = SimpleNamespace(camera=taught, left_out={})
+    told = r"field\?\); but exposures of degree 2 cannot .*, found with degree 3.*--degree 3"
+    for degree, words in ((2, told), (3, r"field\?\)$")):
+        fit = SimpleNamespace(problem=SimpleNamespace(degree=degree), matches=SimpleNamespace(left_out=left))
+        with pytest.warns(AssumptionWarning, match=f"exposure e6 is left out: .*{words}"):
+            agreement.warn_of_lost_exposures(fit, given)

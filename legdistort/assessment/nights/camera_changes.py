@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 from astropy.table import vstack
 
+from ...cameras import places
 from ...cameras.camera import Camera
 from ...cameras.detector import Detector
 from ...cameras.stated_errors import UNKNOWN, with_errors
@@ -13,6 +14,7 @@ from ...exceptions import InputError
 from ...geometry import basis, detector_modes, similarity
 from ...priors.mode_tables import mode_table
 from ...results.errors.common_distortion import NOTHING
+from ...runtime.notebook import Fact
 from ...solving.camera_fit import change_weights, changed, exchanged_maps, held_changes
 
 #: Variance [pix^2] of a direction in which a solution was held rather than determined: no error is so small.
@@ -180,6 +182,16 @@ def modes_of(nights, shape):
     """The `DetectorModes` or `CameraChanges` of nights, of the camera of the first."""
     n = basis.n_modes(nights[0].degree)
     return DetectorModes(shape, n) if nights[0].camera is None else CameraChanges(nights[0].camera, n)
+
+
+def common_maps_in_lines(camera, degree):
+    """What the errors of a layout of several nights leave out, in lines below its table."""
+    words = (
+        f"{places.relative_in_words(degree)} (not determined); what a reference told of that map in a night is no part "
+        "of this camera, but of that which the solution of the night has"
+    )
+    bend = places.bend_in_words(camera, degree)
+    return Fact("", f"{words}; {bend}" if bend else words).lines()
 
 
 def shown_of_camera(solution, label):

@@ -34,7 +34,7 @@ from ...runtime.parallel import map_items
 from ...runtime.trees import codec
 from ...runtime.trees.facts import SIZE, array, number
 from ..known_maps import DETERMINED, KEPT, MEAN_SQUARE, chance
-from .camera_changes import modes_of
+from .camera_changes import common_maps_in_lines, modes_of
 from .combined_nights import Chain, contradiction, fitted, own_scatter2
 from .night_data import EXACT, Night, check_nights, check_numbers, dates_of, given_by, nights_of, standard_numbers
 
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 LAYOUT, ROOT = 1, "legdistort_nights"
 #: Chance below which one of all nights is odd.
 ALARM = 0.003
+_UNNAMED = "camera"
 _WEAK = 10  # errors of a combination in those of most, from which it is told apart
 
 
@@ -472,7 +473,8 @@ class CombinedNights(ShownAsPrinted):
     def __str__(self) -> str:
         n_exposures, count = (sum(getattr(each, name) for each in self.nights) for name in ("n_exposures", "n_nights"))
         of = f"{n_exposures} exposures of {count} night{'s' * (count > 1)}"
-        lines = [f"Camera {self.name}: static distortion of degree {self.degree} from {of}."]
+        named = f"Camera {self.name}".removesuffix(f" {_UNNAMED}")
+        lines = [f"{named}: static distortion of degree {self.degree} from {of}."]
         if not self.scatter.any():
             lines.append("One night does not tell how far nights scatter: errors are those of this night alone.")
         else:
@@ -493,7 +495,8 @@ class CombinedNights(ShownAsPrinted):
             )
         lines += [*self._said_of_odd(), ""]
         if self.has_focal_plane:
-            lines += [*self._camera(None, further_night=False).table_lines(), ""]
+            camera = self._camera(None, further_night=False)
+            lines += [*camera.table_lines(), *common_maps_in_lines(camera, self.degree), ""]
         off = "those of degree 2 and more" if self.has_focal_plane else "shift, rotation and scale taken off"
         lines.append(f"Normalised Legendre modes, undistorted to detector pixels, {off}:")
         lines += [*self.modes().pformat(max_lines=-1, max_width=-1), *self._said_of_weak()]
@@ -529,7 +532,8 @@ def combine_nights(
     results : list of Solution, CombinedNights, Prior or path
         Solutions of nights or fields, folders with one, maps, and earlier combinations, to which the others are added.
     name : str, optional
-        Of the camera; by default the instrument of an earlier combination, else "camera".
+        Of the camera; by default that of an earlier combination, or of the camera of the first night if it has
+        several detectors, else "camera".
     covariate : str, optional
         A number of every exposure on which the static distortion may depend linearly, by a slope of every mode: a
         column of the tables of matches, such as ``match(keywords=...)`` takes from headers. It is kept by the same
@@ -585,7 +589,8 @@ def combine_nights(
     made = list(map_items(reduce, solved, workers=workers, progress=progress, **shown))
     nights += [night for those, _ in made for night in those]
     check_nights(nights, shapes | {shape for _, shape in made})
-    name = name or (earlier[0][1].name if earlier else "camera")
+    named = [each.camera.name for each in nights if each.camera is not None]
+    name = name or next((each.name for _, each in earlier), None) or next(iter(named), _UNNAMED)
     shape = next(iter(shapes | {shape for _, shape in made}))
     if covariate is not None:
         check_numbers(nights, covariate)

@@ -12,11 +12,12 @@ from itertools import combinations, product
 
 import numpy as np
 
+from ...cameras import header_layout
 from ...cameras.camera import Camera, overlapping
 from ...cameras.detector import Detector
 from ...cameras.from_wcs import fullest, stated_detectors
 from ...cameras.header_layout import ANGLE_SAME, SCALE_SAME, orientation_in_words
-from ...exceptions import InputError, MatchError
+from ...exceptions import AssumptionWarning, InputError, MatchError, warn
 from ...geometry import basis, similarity
 from ...inputs.exposure_names import detector_name
 from ..exposure_groups import link
@@ -220,6 +221,28 @@ def turned_by_dithers(detectors, lists, pivots):
 
 def _middle(detector):
     return basis.denormalize(*np.zeros((2, 1)), detector.shape)[0]
+
+
+def with_usual_scales(camera):
+    """The camera by headers, detectors whose pixels these have of another size than most with that of the others.
+
+    Warns
+    -----
+    AssumptionWarning
+        Naming these, and by how much.
+    """
+    detectors, odd = header_layout.with_usual_scales(camera.detectors)
+    if not odd:
+        return camera
+    told = ", ".join(f"{key} {ratio:.3f} times" for key, ratio in odd.items())
+    warn(
+        f"the headers have the pixels of detector {told} as large as those of the other {len(detectors) - len(odd)}, "
+        "which agree: it is taken to have pixels as large as theirs, and the sky is that of the others; exposures "
+        "alone hardly tell which is right, a reference does (--reference); how well headers are known otherwise is "
+        "--layout-sigma of solve, and a camera with such a detector is a camera file (--camera)",
+        AssumptionWarning,
+    )
+    return replace(camera, detectors=detectors)
 
 
 def _moves(lists):

@@ -13,9 +13,9 @@ from ...runtime.trees.facts import number
 
 #: Names in a sentence.
 _MOST_NAMED = 6
-#: Relative errors of the scale from which on it is told, and contradicts what the headers state: static distortions and
+#: Relative error of the scale from which on it contradicts what the headers state: static distortions and
 #: dithers alone, which headers know nothing of, make it some tenths of a per cent.
-_SCALE_TOLD, _SCALE_OFF = 3e-4, 8e-3
+_SCALE_OFF = 8e-3
 #: Errors of the place of the plane by headers of detectors that contradict one another [pix] up to this are said alone.
 _APART = 20.0
 #: What is done about headers that contradict the others.
@@ -40,7 +40,8 @@ class HeaderPointing:
     groups : tuple of tuple of str
         Exposures whose headers agree with one another, where no majority does.
     scale : float
-        Least error of the scale of the plane, relative, by the scatter of these headers; NaN of a single one.
+        Least error of the scale of the plane, relative, by the scatter of these headers, in scale and rotation, and of
+        sizes of pixels of detectors about theirs; NaN of a single header of one detector.
     detectors : dict
         ``{detector: pixels}`` of a camera by which the headers of some are off; of all of them with NaN where nothing
         shows which are right, and the sky is not known.
@@ -143,7 +144,7 @@ class HeaderPointing:
         error = 1000 * pixel_scale * self.shift
         size = f"{error:.2g}" if error < 100 else f"{error:.0f}"
         turn = f", of its rotation {self.turn:.2g} deg" if np.isfinite(self.turn) else ""
-        scale = f"{self.scale:.1g} of it at least" if self.scale > _SCALE_TOLD else "as they state it"
+        scale = f"{self.scale:.1g} of it at least" if self.scale > 0 else "as they state it"
         if camera:
             of_scale, of_turn = ("", "") if errors is None else (f"{errors[0]:.1g} ", f" ({errors[1]:.1g} deg)")
             scale = (

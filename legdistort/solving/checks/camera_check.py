@@ -167,6 +167,28 @@ def _alike(solution, headers, where):
     return words
 
 
+def beside_camera_check(solution, camera):
+    """What this check of the camera and that of the pointing compare with headers, and what tells which is right.
+
+    In words behind others; empty where headers have the detectors as they lie.
+    """
+    headers = solution.camera.headers
+    if camera is None or camera.state not in WRONG or headers is None or not (headers.odd or headers.is_undecided):
+        return ""
+    errors, there = solution.estimate.uncertainty.camera, "the given layouts"
+    found = errors is not None and bool(errors.free[:, :, :3].any())
+    if found:
+        there = "the stars, by dithers from one detector to another,"
+    told = "of the sky nothing but a reference tells (--reference)"
+    told = f"the stars tell the first, {told}" if found else f"of the first --layout fit tells, {told}"
+    if solution.gauge.tie is not None:
+        told = "the reference tells both, and the headers count for neither"
+    return (
+        f"; check camera compares how headers have the detectors to each other with how {there} have them, this one "
+        f"where headers put detectors and exposures on the sky: {told}"
+    )
+
+
 def contradicted_layout(solution, camera):
     """The check of a layout that is held by the stars that cross from detector to detector and are left out for it.
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import special
 
 from ...exceptions import some_of
-from ...geometry import similarity
+from ...geometry import basis, similarity
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...results.check import FALSE_ALARM, Check, FactorTest, state_of
 from ...results.errors import absolute_errors
@@ -46,6 +46,13 @@ def significance(solution, *, top_only=False):
         t = a @ np.linalg.pinv(rows @ covariance @ rows.T, hermitian=True) @ a / scale
         best = min(best, n * special.chdtrc(len(rows), t))
     return best
+
+
+def has_static_of_degree(solution):
+    """Whether detectors in a focal plane have modes of the degree, which exposures of a lower one do not take over."""
+    top = slice(basis.n_modes(solution.degree - 1), basis.n_modes(solution.degree))
+    detectors = solution.camera.detectors.values() if solution.camera.has_focal_plane else ()
+    return any(np.any(each.static[:, top]) for each in detectors)
 
 
 def dynamic_check(solution, problem, blocks):

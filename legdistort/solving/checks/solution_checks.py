@@ -18,9 +18,9 @@ from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
 from ...results.errors.header_pointing import CURE as POINTING_CURE
 from ...results.gauge import warning_of
 from ..terms.observed import Observed
-from .camera_check import camera_check, contradicted_layout, undetermined
+from .camera_check import beside_camera_check, camera_check, contradicted_layout, undetermined
 from .cures import camera_first, header_first, with_cost, with_cures
-from .dynamic_check import EVIDENCE, dynamic_check, mirrored_check, nights_check, significance
+from .dynamic_check import EVIDENCE, dynamic_check, has_static_of_degree, mirrored_check, nights_check, significance
 from .extrapolated_maps import extrapolation_check
 from .limits import MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
@@ -107,7 +107,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
         stars_check(solution, observed),
         completeness_check(solution, residuals),
         header_check(header_distortion),
-        pointing_check(solution),
+        pointing_check(solution, camera),
     )
     made |= {check.name: check for check in others if check is not None}
     made["absolute"] = absolute_check(solution, made)
@@ -355,9 +355,9 @@ def degree_check(solution, residuals, *, shows_static):
                      f"--degree {more}, or --degree auto")  # fmt: skip
     p = significance(solution, top_only=True)
     if solution.degree > 1 and p > 0.05 and not solution.diagnostics.prior_has_widths:
+        lower = "" if has_static_of_degree(solution) else f"--degree {solution.degree - 1}, or "
         return Check("degree", "warn", score.rms, error,
-                     f"no exposure has modes of degree {solution.degree} beyond noise",
-                     f"--degree {solution.degree - 1}, or {EVIDENCE}")  # fmt: skip
+                     f"no exposure has modes of degree {solution.degree} beyond noise", lower + EVIDENCE)  # fmt: skip
     found = f"degree {more} would explain nothing more{little}"
     if not shows_static:
         found += " of what changes between exposures; what they have in common would go into the stars"
@@ -472,14 +472,19 @@ def duplicates_check(solution, residuals):
     return Check("duplicates", "warn", value[same[0]], _SAME, found, f"{cure}--errors correlated counts that")
 
 
-def pointing_check(solution):
-    """Do headers say that exposures lie otherwise to each other than the stars have them? None where none does."""
+def pointing_check(solution, camera=None):
+    """Do headers say that exposures lie otherwise to each other than the stars have them? None where none does.
+
+    Beside the check of the `camera`, if there is one, by which headers have detectors elsewhere, what each of the two
+    compares is said, and what tells which is right.
+    """
     pointing = solution.diagnostics.pointing
     if pointing is None or not (words := pointing.sentence):
         return None
     n = len(pointing.off) + sum(map(len, pointing.groups)) + len(pointing.detectors)
     by_headers = solution.sky is not None and solution.diagnostics.sky == "exposures" and solution.gauge.tie is None
     state = "fail" if pointing.is_undecided and by_headers else "warn"
+    words += beside_camera_check(solution, camera)
     return Check("header pointing", state, float(n), 0.0, words, POINTING_CURE)
 
 
