@@ -162,7 +162,8 @@ def _set_right(table, exposures, shape, begun, options):
 
 def _without_lost(found, least):
     """The detections without those of detectors, or images, of which so few are tied as chance ties, with a warning."""
-    if lost := found.lost(_CHANCE, least):
+    lost = found.lost(_CHANCE, least)
+    if lost:
         ids = found.camera.ids(found.table)
         found.star[np.isin(ids, lost)] = -1
         warn(
@@ -173,6 +174,7 @@ def _without_lost(found, least):
     if found.camera is None or not found.camera.has_focal_plane or len(found.names) < 2:
         return found
     foreign = foreign_images(found.camera, found.table, found.star, found.is_tied(least))
+    foreign = {image: counts for image, counts in foreign.items() if image[1] not in lost}
     if foreign:
         images = zip(found.table["exposure"], found.camera.ids(found.table), strict=True)
         found.star[[image in foreign for image in images]] = -1
