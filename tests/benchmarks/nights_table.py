@@ -1,7 +1,8 @@
 """Absolute errors where the exposures of a night share a departure: ``python tests/benchmarks/nights_table.py``.
 
-By setting: squared pull of finite absolute errors (nights found by the epochs, and all taken for one), share of the
-sets with finite ones, rms error in pixels and that of the same sets without the odd nights; share of the sets in which
+By setting: squared pull of finite absolute errors (nights found by the epochs, and all taken for one), by how much
+chance alone would have it off 1 if errors are as stated (a set has few directions that are large), share of the sets
+with finite ones, rms error in pixels and that of the same sets without the odd nights; share of the sets in which
 every odd night is named with all its exposures, in which anything else is named, and in which exposures are called
 duplicates; medians by set of the squared pull and of the rms error in pixels, and the largest squared pull of a set.
 """
@@ -55,13 +56,20 @@ def solved(table, words):
 
 
 def square(nights, solution):
-    """Squares of absolute errors and their variances, of the finite ones, and the mean square error."""
+    """Squares of absolute errors and their variances, of the finite ones, the mean square error, and by chance.
+
+    The last is the variance of the first if the errors are as stated, common maps alone.
+    """
     off = nights.offsets(solution.stars, solution.stars.meta.get("epoch") or 2017.0)
     stated = np.full(off.shape, np.nan)
     if "x_err_abs" in solution.stars.colnames:  # else nothing is known of any
         stated = np.column_stack([solution.stars[c].value for c in ("x_err_abs", "y_err_abs")])
     finite = np.isfinite(stated) & np.isfinite(off)
-    return np.sum(off[finite] ** 2), np.sum(stated[finite] ** 2), np.nanmean(off**2)
+    moved = solution.gauge.directions[finite.all(axis=1)]
+    variance, maps = np.linalg.eigh(solution.gauge.absolute_covariance)
+    common = moved.reshape(-1, moved.shape[2]) @ maps * np.sqrt(np.maximum(variance, 0))
+    by_chance = 2 * np.sum((common.T @ common) ** 2)
+    return np.sum(off[finite] ** 2), np.sum(stated[finite] ** 2), np.nanmean(off**2), by_chance
 
 
 def names(solution, odd):
@@ -73,10 +81,10 @@ def names(solution, odd):
     return 0 < len(right) == len(odd), len(tests) > len(right), checks["duplicates"].state != "pass"
 
 
-def row(words, n, *, one=True):
-    """Figures of a setting, over n sets, and as if all were `one` night."""
+def row(words, seeds, *, one=True):
+    """Figures of a setting, over sets by their seeds, and as if all were `one` night."""
     sums = {"found": [], "one": [], "without": [], "names": []}
-    for seed in range(n):
+    for seed in seeds:
         nights = Nights(seed, **words)
         tables = {"found": nights.table, "one": nights.table.copy()}
         odd = words.get("odd_ones", (nights.odd,) if "odd" in words else ())
@@ -122,6 +130,7 @@ def main():
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sets", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first set")
     parser.add_argument("--only", nargs="*", default=list(SETTINGS))
     parser.add_argument("--names", action="store_true", help="alone: nothing is taken for one night")
     parser.add_argument("--motions", action="store_true", help="motions alone, of two to five nights, as static='fit'")
@@ -133,21 +142,22 @@ def main():
                 sets = f"single sets {single.min():9.4f} to {single.max():.4f}"
                 print(f"static={static} {n_nights} nights {pooled:9.4f}   {sets}, stated of {known:.2f}", flush=True)
         return
-    heads = "pull^2", "finite", "one", "finite", "rms", "without", "named", "false", "twice"
+    heads = "pull^2", "chance", "finite", "one", "chance", "finite", "rms", "without", "named", "false", "twice"
     heads += "median", "rms", "most"
     print(f"{'':36} " + " ".join(f"{head:>7}" for head in heads))
     for name in asked.only:
-        sums = row(SETTINGS[name], asked.sets, one=not asked.names)
+        sums = row(SETTINGS[name], range(asked.first, asked.first + asked.sets), one=not asked.names)
         cells = []
         for each in ("found", "one"):
             if each not in sums:
-                cells += [np.nan, np.nan]
+                cells += [np.nan, np.nan, np.nan]
                 continue
-            off, stated, _ = sums[each].T
-            cells += [off.sum() / stated.sum() if stated.any() else np.nan, np.mean(stated > 0)]
+            off, stated, _, by_chance = sums[each].T
+            known = stated.sum() if stated.any() else np.nan
+            cells += [off.sum() / known, np.sqrt(by_chance.sum()) / known, np.mean(stated > 0)]
         cells += [np.sqrt(sums[each][:, 2].mean()) if each in sums else np.nan for each in ("found", "without")]
         cells += sums["names"].mean(axis=0).tolist()
-        off, stated, error2 = sums["found"].T
+        off, stated, error2, _ = sums["found"].T
         pulls = off / np.where(stated > 0, stated, np.nan)
         cells += [np.nanmedian(pulls), np.median(np.sqrt(error2)), np.nanmax(pulls)]
         print(f"{name:36} " + " ".join(f"{cell:7.3f}" for cell in cells), flush=True)
