@@ -69,9 +69,9 @@ def read_lists(a, contract):
     filled = [a.error is not None and len(table) and np.all(_errors(table) == a.error) for table in read.values()]
     if 0 < sum(filled) < len(filled):
         log.info("all positions come without an error in %s", _some(read, filled))
-    dated = ["epoch" in table.colnames for table in read.values()]
-    if a.dates is None and not a.wcs and 0 < sum(dated) < len(dated):
-        log.info("no date is known of %s: --dates states them", _some(read, [not each for each in dated]))
+    undated = ["epoch" not in table.colnames for table in read.values()]
+    if a.dates is None and not a.wcs and 0 < sum(undated) < len(undated):
+        log.info("no date is known of %s: --dates TABLE, with those of all, states them", _some(read, undated))
     _warn_of_large_errors(read)
     if a.dates is not None:
         return with_dates(read, read_dates(a.dates), a.dates)

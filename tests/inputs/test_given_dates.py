@@ -120,7 +120,7 @@ def test_lists_without_a_date_are_named(tmp_path, caplog):
         (tmp_path / f"{name}.csv").write_text(f"x,y,x_err,y_err{more}\n1.0,2.0,0.1,0.1{',2010.5' if more else ''}\n")
     lists = sorted(map(str, tmp_path.glob("*.csv")))
     given_files.read_lists(parser._parsed(["match", *lists, "--out", "m.ecsv"]), None)
-    assert "no date is known of 1 of 3 lists (b.csv): --dates states them" in caplog.text
+    assert "no date is known of 1 of 3 lists (b.csv): --dates TABLE, with those of all, states them" in caplog.text
     caplog.clear()
     given_files.read_lists(parser._parsed(["match", *lists[::2], "--out", "m.ecsv"]), None)
     assert "no date" not in caplog.text
