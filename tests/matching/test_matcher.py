@@ -249,6 +249,28 @@ def test_short_lists_do_not_match_by_chance(n, m):
         assert register(*lists) is None
 
 
+def test_fast_stars_are_kept_with_a_tolerance_which_is_told(caplog):
+    """Stars of 0.6 px a year over six years: what is found of the tolerance is of the others, which rest."""
+    rng, tables = np.random.default_rng(5), []
+    stars, motion = rng.uniform(250, 1797, (80, 2)), np.zeros((80, 2))
+    motion[:10] = 0.6 * np.array([[1, 0]])
+    for k, year in enumerate(np.repeat([2012.0, 2015.0, 2018.0], 2)):
+        xy = stars + motion * (year - 2015) + rng.uniform(-200, 200, 2) + rng.normal(0, 0.01, stars.shape)
+        tables.append(detections(f"e{k}", xy, flux=np.linspace(100, 1, 80), truth=np.arange(80)))
+        tables[-1]["epoch"] = year
+    table = vstack(tables)
+    with caplog.at_level("INFO", logger="legdistort"):
+        plain = match(table, shape=SHAPE, min_exposures=2)
+    assert "the exposures span 6.0 years: stars that move farther" in caplog.text
+    caplog.clear()
+    with caplog.at_level("INFO", logger="legdistort"):
+        wide = match(table, shape=SHAPE, min_exposures=2, tolerance=4.0)
+    assert "span" not in caplog.text
+    assert len(plain.stars) > 80
+    assert len(wide.stars) == 80
+    assert len(wide.table) == 480
+
+
 @pytest.mark.slow
 def test_two_groups():
     one = make_field(60, *six_poses(0.5, 100), seed=1)
