@@ -68,11 +68,20 @@ def read_lists(a, contract):
     read = told_apart([(Path(path), read_given(path, a, contract)) for path in a.tables])
     filled = [a.error is not None and len(table) and np.all(_errors(table) == a.error) for table in read.values()]
     if 0 < sum(filled) < len(filled):
-        log.info("these are %d of %d lists", sum(filled), len(filled))
+        log.info("all positions come without an error in %s", _some(read, filled))
+    undated = ["epoch" not in table.colnames for table in read.values()]
+    if a.dates is None and not a.wcs and 0 < sum(undated) < len(undated):
+        log.info("no date is known of %s: --dates TABLE, with those of all, states them", _some(read, undated))
     _warn_of_large_errors(read)
     if a.dates is not None:
         return with_dates(read, read_dates(a.dates), a.dates)
     return read if a.wcs else with_own_dates(read)
+
+
+def _some(read, which):
+    """Some of the lists ``{path: table}``, in words."""
+    names = [path.name for path, is_one in zip(read, which, strict=True) if is_one]
+    return f"{len(names)} of {len(read)} lists ({some_of(names, 6)})"
 
 
 def _errors(table):

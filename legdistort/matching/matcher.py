@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
     from ..runtime.annotations import Shape, StrPath
 
 log = logging.getLogger(__name__)
+
+#: Years between exposures in which stars may move by more than the tolerance that is found.
+LONG = 1.0
 
 
 @plain_numbers
@@ -168,7 +172,22 @@ def match(
     _add_stated(table, named or {})
     distortions = header_distortions(named[name] for name in np.unique(table["exposure"])) if named else {}
     matches = _finish(table, star, shapes, found.headers, left_out, epoch, distortions)
+    _tell_of_motions(matches, tolerance)
     return replace(matches, left_out=found.copies | left_out, camera=camera)
+
+
+def _tell_of_motions(matches, tolerance):
+    """Say that stars which move may have been lost, where dates are years apart and no tolerance is given."""
+    span = 0.0
+    if tolerance is None and "epoch" in matches.table.colnames:
+        with contextlib.suppress(InputError):  # of some the time is not known, which matters where motions are fitted
+            span = float(np.ptp(matches.epochs))
+    if span > LONG:
+        log.info(
+            "the exposures span %.1f years: stars that move farther than others scatter lose observations, or count as "
+            "several; --tolerance PIXELS, as far as they move in that time, keeps them where stars are sparse",
+            span,
+        )
 
 
 def _with_headers_exchanged(camera, table, star, shapes, exposures):

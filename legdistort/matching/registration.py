@@ -17,7 +17,7 @@ from .similarity_candidates import offset_candidates, triangle_candidates
 from .star_lists import Warp, allowed_degree, fit_warp
 
 #: How far above chance the number of pairs must be, ``k ln(k/expected) - k + expected`` (natural units,
-#: k = pairs less modes fitted). All seeds of 500 pairs of unrelated lists reached 13.
+#: k = pairs less those that fix the map). All seeds of 500 pairs of unrelated lists reached 13.
 MIN_STRENGTH = 18.0
 #: Part of the shorter list, within the overlap, that must be paired: a map that holds in a corner only is no match.
 MIN_SHARE = 0.15
@@ -280,7 +280,7 @@ def grow(source, target, pose, order=None):
         if stage < 5:
             continue
         if stage == 5 or n == total:
-            radius, strength = _best_radius(warp(source.xy[chosen]), tree, width, len(warp.coefficients))
+            radius, strength = _best_radius(warp(source.xy[chosen]), tree, width, warp.n_fixing)
         if stage == 5 and strength < 3:
             return None
         if n < total:
@@ -310,21 +310,21 @@ def _fit_near(source, chosen, tree, warp, width, degree, parity):
     return fit_warp(p, q, source.shape, degree, weights=w, width=width, parity=parity)
 
 
-def _best_radius(predicted, tree, width, n_modes):
+def _best_radius(predicted, tree, width, n_fixing):
     some = predicted[:: len(predicted) // 500 + 1]
     radii = [factor * width for factor in (0.5, 1, 2.5)]
     nearest = tree.query(some, distance_upper_bound=radii[-1])
-    strengths = {radius: _strength(some, tree, nearest, radius, n_modes) for radius in radii}
+    strengths = {radius: _strength(some, tree, nearest, radius, n_fixing) for radius in radii}
     return max(strengths.items(), key=lambda item: item[1])
 
 
-def _strength(predicted, tree, nearest, radius, n_modes):
+def _strength(predicted, tree, nearest, radius, n_fixing):
     """How far the number of hits is above chance; local densities of the target allow for crowded places.
 
     `nearest` holds the distances and rows of the target's stars nearest to those predicted, within the radius at least.
     """
     distance, row = nearest
-    hits = len(np.unique(row[distance < radius])) - n_modes
+    hits = len(np.unique(row[distance < radius])) - n_fixing
     some = predicted[:: len(predicted) // 200 + 1]
     around = tree.query_ball_point(some, 8 * radius, return_length=True).sum() * len(predicted) / len(some)
     around = max(around - hits, 1) / 64
@@ -397,7 +397,7 @@ def _judged(source, target, warp, limit, tolerance):
     i, j, distance = _mutual(mapped, source, target, limit, max(_farthest(target), limit), lone=True)
     predicted, _ = mapped
     nearest = target.tree.query(predicted, distance_upper_bound=limit)
-    strength = _strength(predicted, target.tree, nearest, limit, len(warp.coefficients))
+    strength = _strength(predicted, target.tree, nearest, limit, warp.n_fixing)
     possible = np.mean(target.on_detector(predicted)) * min(len(source), len(target))
     if strength < MIN_STRENGTH or not possible or len(i) < max(5, MIN_SHARE * possible):  # none may fall on the image
         return None

@@ -62,12 +62,17 @@ class StarList:
 class Warp:
     """Polynomial map from one list to another: coefficients (n_modes, 2) in the basis of the source's detector.
 
-    `covariance` is that of the coefficients for positions of unit variance, (n_modes, n_modes); None if not known.
+    `covariance` is that of the coefficients for positions of unit variance, (n_modes, n_modes); None for a similarity.
     """
 
     coefficients: np.ndarray
     shape: tuple
     covariance: np.ndarray | None = None
+
+    @property
+    def n_fixing(self):
+        """Number of pairs of positions that fix it: 2 for a similarity, else that of its modes."""
+        return 2 if self.covariance is None else len(self.coefficients)
 
     def __call__(self, xy):
         """Map positions (n, 2)."""

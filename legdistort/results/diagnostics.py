@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 #: (measured: none of 100, tests/benchmarks/motions_table.py).
 MOVING = 6.6
 
-#: Fits of a law of errors one after the other, each with the weights of that before.
-_ROUNDS = 20
+#: Fits of a law of errors one after the other, each with the weights of that before; halvings of a step that is too
+#: long, and the gain in the logarithm of the likelihood below which there is nothing left to find.
+_ROUNDS, _HALVINGS, _NO_GAIN = 20, 10, 1e-6
 #: Law and factors of exposures are found in turn. An exposure counts as if so many of its stars scattered as those of
 #: the others: its factor is known as well as 10 %.
 _SWEEPS, _COMMON_STARS = 5, 20
@@ -169,16 +170,13 @@ class ErrorLaw:
     def of(cls, flux: ArrayLike, variance: ArrayLike, factors: dict[str, float] | None = None) -> ErrorLaw:
         """The law that variances [pix^2] follow, measured at some fluxes (n,): as the mean of a gamma distribution.
 
-        The spread of a measured variance goes with the true one: weights of the law itself, from a constant on.
+        The spread of a measured variance goes with the true one. The likeliest law is sought from each of its terms
+        alone, as from a bad start the search may end at another than the best.
         """
         flux = np.asarray(flux, dtype=float)
         terms = np.column_stack([flux**-2.0, 1 / flux, np.ones(len(flux))])
-        model = np.full(len(flux), np.mean(variance))
-        for _ in range(_ROUNDS):
-            weighted = terms / model[:, None]
-            norm = np.sqrt((weighted**2).sum(axis=0))
-            size = nnls(weighted / norm, variance / model)[0] / norm
-            model = np.maximum(terms @ size, 1e-6 * np.mean(variance))
+        alone = np.diag(np.mean(np.asarray(variance)[:, None] / terms, axis=0))
+        _, size = min((_likeliest(terms, variance, start) for start in alone), key=lambda found: found[0])
         return cls(*map(float, np.sqrt(size)), factors or {})
 
     @classmethod
@@ -249,6 +247,36 @@ class ErrorLaw:
             f"by brightness, from the scatter of the stars: sqrt(({self.a:.4g} / flux)^2 + {self.b:.4g}^2 / flux + "
             f"{self.floor:.4g}^2) px, times {min(factors):.2f} to {max(factors):.2f} by exposure{of}"
         )
+
+
+def _likeliest(terms, variance, size):
+    """Minus the logarithm of the likelihood, and sizes >= 0 of terms (n, k) with which they follow measured variances.
+
+    Reweighted least squares, which move down the likelihood at first; a whole step may lead past the minimum, where
+    the next leads back, and the two go on for ever.
+    """
+
+    def badness(model):
+        return np.sum(np.log(model) + variance / model)
+
+    model = terms @ size
+    least = badness(model)
+    for _ in range(_ROUNDS):
+        weighted = terms / model[:, None]
+        norm = np.sqrt((weighted**2).sum(axis=0))
+        step = nnls(weighted / norm, variance / model)[0] / norm - size
+        for part in 0.5 ** np.arange(_HALVINGS):
+            moved = size + part * step
+            if not np.any(moved):
+                continue
+            moved *= np.mean(variance / (terms @ moved))  # the likeliest scale
+            if badness(terms @ moved) < least - _NO_GAIN:
+                break
+        else:
+            break
+        size, model = moved, terms @ moved
+        least = badness(model)
+    return least, size
 
 
 def filled(flux: np.ndarray, level: np.ndarray | float) -> np.ndarray:

@@ -191,6 +191,15 @@ class Drift:
         are = "is" if unknown == ["the mean parallax"] else "are"
         return f"{words}, after {' and '.join(unknown)}, which {are} not known without a reference."
 
+    @property
+    def convention(self) -> str:
+        """What of the motions no reference tells, and what stands for it, in words; empty with a reference."""
+        if self.n_tied:
+            return ""
+        by = "rotation and scale are those of the nominal poses"
+        by = by if self.held else f"their mean is zero, {by}"
+        return f"motions up to common rates of shift, rotation and scale, not known without a reference ({by})"
+
     def tied(self, joint: np.ndarray, n_tied: int, parallax_tied: bool) -> Drift:
         """The same where a reference determined the maps, with the `joint` covariance."""
         size = len(joint) - len(self.covariance)
@@ -451,6 +460,11 @@ class Gauge(ShownAsPrinted):
         return in_words(self.unknown_names) if self.unknown_names else ""
 
     @property
+    def rates_in_words(self) -> str:
+        """What of the motions of stars is a convention, and which; empty without motions, or if all is known."""
+        return "" if self.drift is None or self.poses_known else self.drift.convention
+
+    @property
     def warning(self) -> str:
         """In a sentence, that absolute positions are not known, why, and what to do; empty if they are."""
         if not self.unknown_names:
@@ -475,6 +489,7 @@ class Gauge(ShownAsPrinted):
         known = f"{tied}absolute to {error:.2g} px rms per axis{after}{aside}{doubt}"
         if after and error == 0:  # nothing of the common map is known
             known = "absolute positions are not known"
+        known += f"; {self.rates_in_words}" if self.rates_in_words else ""
         return f"{self.kind} ({_CONVENTIONS[self.kind]}), {self.n_maps} modes of a common map; {known}"
 
     def __repr__(self) -> str:

@@ -156,6 +156,7 @@ def _meta(solution):
         "frame": "reference plane" if solution.sky is None else "ICRS",
         "epoch": epoch(solution),
         "gauge": solution.gauge.kind,
+        "motions": solution.gauge.rates_in_words or None,
         "degree": solution.degree,
         "pixel_scale": pixel_scale(solution),
         "prior": None if solution.settings.prior is None else str(prior or "given"),

@@ -228,7 +228,8 @@ class Solution(ShownAsPrinted):
         `~astropy.coordinates.SkyCoord` (not in files). ``flux`` is the mean over the exposures, each brought to their
         mean depth by the fluxes of common stars; where these do not join the exposures, as they are, which the
         description of the column says. ``meta`` has ``frame``, ``epoch`` (a Julian year, if it is
-        known), ``gauge``, ``degree``, ``pixel_scale`` (arcsec, of the sky or as stated), ``prior`` and ``version``.
+        known), ``gauge``, ``motions`` (what of these is a convention), ``degree``, ``pixel_scale`` (arcsec, of the sky
+        or as stated), ``prior`` and ``version``.
 
         Where motions were fitted, positions are those of the epoch, and there are ``vx``, ``vy`` [pix/yr], with a sky
         ``pmra`` (with cos(dec)), ``pmdec`` [mas/yr] and, if it was fitted, ``parallax`` [mas], all with relative and

@@ -4,8 +4,11 @@ from itertools import zip_longest
 
 import numpy as np
 
+from ..results.gauge import CURE
 from ..runtime.notebook import Column, Grid, Heading, Sentence
 
+#: What a plan can state in place of what is done with exposures.
+_CURE = "give a prior (--prior) or its size (--static-sigma), or, in Python, poses of a camera that is turned (poses=)"
 _MOTIONS = {"motion": "proper motions, relative [{}/yr]", "motion_abs": "proper motions, absolute [{}/yr]"}
 _MOTIONS |= {"parallax": "parallaxes, relative [{}]", "parallax_abs": "parallaxes, absolute [{}]"}
 
@@ -104,7 +107,8 @@ def _absolute(prediction):
 
 def _relative(prediction):
     words = f"what is left once a common map of degree {prediction.degree} is taken off"
-    return "; ".join(filter(None, [words, prediction.solution.gauge.warning]))
+    warning = prediction.solution.gauge.warning.replace(CURE, _CURE)
+    return "; ".join(filter(None, [words, warning]))
 
 
 def describe_plans(plans):

@@ -101,7 +101,7 @@ def starved(problem, used):
         if (left := np.count_nonzero(mine)) < max(problem.n_free(i), 1):
             out[name] = (
                 f"{left} of its {len(mine)} stars agree with other exposures, and its distortion has "
-                f"{problem.n_free(i)} modes; lower the degree, or give a prior with sigma"
+                f"{problem.n_free(i)} modes; lower the degree, or give a prior with sigma (--prior-sigma evidence)"
             )
     return out
 

@@ -251,6 +251,8 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
     if start_values.far_off(problem, typical).any() and (astray := agreement.astray(problem)):
         return minimise(matches.without(astray), options, judged=judged)
     as_near = trial and near_by and (near.options.degree, near.options.clip) == (options.degree, None)
+    if as_near:  # with the plane held where all is most probable it is no plain fit, and may have more modes
+        as_near = near.problem.centre is None
     plain = near.result if as_near else _plain(problem, start, common)
     given = problem
     problem, plain, near, explained = _first(matches, given, start, plain, common, options.clip)

@@ -204,6 +204,18 @@ def test_nights_make_one_camera(three, tmp_path):
     assert ld.difference(again, static_prior(1)).agrees
 
 
+def test_nights_without_a_date_are_named(three):
+    """Not that no change with time is seen, for which nobody has looked."""
+    nights = list(three)
+    assert "is not looked for" not in str(ld.combine_nights(nights))
+    table = three[-1].residuals.copy()
+    table.remove_columns(["dx", "dy", "used", *({"epoch"} & set(table.colnames))])
+    undated = ld.solve(ld.Matches.from_table(table, shape=three[-1].estimate.shapes, poses=three[-1].poses), degree=3)
+    combined = str(ld.combine_nights([*nights[:-1], undated]))
+    assert "Change with time is not looked for: solution 3 has no date." in combined
+    assert "No change with time" not in combined
+
+
 def static_prior(seed, factor=1.0):
     return ld.Prior(factor * modes(static(seed)), shape=SHAPE)
 

@@ -106,10 +106,24 @@ def test_the_number_of_lists_without_errors_is_told(tmp_path, caplog):
     lists = sorted(map(str, tmp_path.glob("*.csv")))
     given_files.read_lists(parser._parsed(["match", *lists, "--error", "0.02", "--out", "m.ecsv"]), None)
     assert "where all positions of a list come without an error, it is taken as 0.02 pixels" in caplog.text
-    assert "these are 2 of 4 lists" in caplog.text
+    assert "all positions come without an error in 2 of 4 lists (a.csv, c.csv)" in caplog.text
     caplog.clear()
     given_files.read_lists(parser._parsed(["match", *lists[::2], "--error", "0.02", "--out", "m.ecsv"]), None)
-    assert "these are" not in caplog.text
+    assert "of 2 lists" not in caplog.text
+
+
+def test_lists_without_a_date_are_named(tmp_path, caplog):
+    from legdistort.cli import given_files, parser
+
+    caplog.set_level("INFO", logger="legdistort")
+    for name, more in (("a", ",epoch"), ("b", ""), ("c", ",epoch")):
+        (tmp_path / f"{name}.csv").write_text(f"x,y,x_err,y_err{more}\n1.0,2.0,0.1,0.1{',2010.5' if more else ''}\n")
+    lists = sorted(map(str, tmp_path.glob("*.csv")))
+    given_files.read_lists(parser._parsed(["match", *lists, "--out", "m.ecsv"]), None)
+    assert "no date is known of 1 of 3 lists (b.csv): --dates TABLE, with those of all, states them" in caplog.text
+    caplog.clear()
+    given_files.read_lists(parser._parsed(["match", *lists[::2], "--out", "m.ecsv"]), None)
+    assert "no date" not in caplog.text
 
 
 def test_columns_that_are_no_errors_are_named(tmp_path):

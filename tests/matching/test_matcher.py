@@ -219,6 +219,58 @@ def test_unrelated_lists_do_not_match():
             assert register(*lists) is None
 
 
+@pytest.mark.parametrize("seed", [3, 4, 11, 14, 15, 23])
+def test_lists_of_eight_stars_that_agree_are_matched(seed):
+    """A shift that carries all eight of one list to stars of another of 300 is no chance."""
+    rng = np.random.default_rng(seed)
+    stars, static = rng.uniform(50, 974, (300, 2)), rng.normal(0, 3, (7, 2))
+
+    def seen(rows, flux, shift=(0.0, 0.0)):
+        q = stars[rows] + shift
+        x, y = (q - 511.5).T / 512
+        q += np.stack([x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], axis=1) @ static
+        return StarList(q + rng.normal(0, 0.01, q.shape), np.full(len(q), 0.01), (1024, 1024), flux)
+
+    few = rng.choice(40, 8, replace=False)
+    full, short = seen(np.arange(300), 10 ** np.linspace(5, 2, 300)), seen(few, np.linspace(2e5, 1e5, 8), (3, -2))
+    there, back = register(short, full), register(full, short)
+    assert np.array_equal(there.target[np.argsort(there.source)], few)
+    assert np.array_equal(back.source[np.argsort(back.target)], few)
+    others = StarList(rng.uniform(0, 1023, (8, 2)), np.full(8, 0.01), (1024, 1024), np.linspace(2e5, 1e5, 8))
+    assert register(others, full) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "m"), [(8, 150), (12, 12), (15, 100), (30, 30), (20, 300)])
+def test_short_lists_do_not_match_by_chance(n, m):
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        lists = [StarList(rng.uniform(0, 2048, (k, 2)), np.full(k, 0.1), SHAPE, rng.random(k)) for k in (n, m)]
+        assert register(*lists) is None
+
+
+def test_fast_stars_are_kept_with_a_tolerance_which_is_told(caplog):
+    """Stars of 0.6 px a year over six years: what is found of the tolerance is of the others, which rest."""
+    rng, tables = np.random.default_rng(5), []
+    stars, motion = rng.uniform(250, 1797, (80, 2)), np.zeros((80, 2))
+    motion[:10] = 0.6 * np.array([[1, 0]])
+    for k, year in enumerate(np.repeat([2012.0, 2015.0, 2018.0], 2)):
+        xy = stars + motion * (year - 2015) + rng.uniform(-200, 200, 2) + rng.normal(0, 0.01, stars.shape)
+        tables.append(detections(f"e{k}", xy, flux=np.linspace(100, 1, 80), truth=np.arange(80)))
+        tables[-1]["epoch"] = year
+    table = vstack(tables)
+    with caplog.at_level("INFO", logger="legdistort"):
+        plain = match(table, shape=SHAPE, min_exposures=2)
+    assert "the exposures span 6.0 years: stars that move farther" in caplog.text
+    caplog.clear()
+    with caplog.at_level("INFO", logger="legdistort"):
+        wide = match(table, shape=SHAPE, min_exposures=2, tolerance=4.0)
+    assert "span" not in caplog.text
+    assert len(plain.stars) > 80
+    assert len(wide.stars) == 80
+    assert len(wide.table) == 480
+
+
 @pytest.mark.slow
 def test_two_groups():
     one = make_field(60, *six_poses(0.5, 100), seed=1)

@@ -115,6 +115,24 @@ def law_of(table, poses):
     return solution, solution.residuals["x_err"].value[np.asarray(table["exposure"]) == "e04"]
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2, 5, 33])
+def test_law_of_measured_variances(seed):
+    """Fluxes over seven magnitudes, three faint positions that are wrong: the search went to and fro for ever.
+
+    It ended at a law that is five times too small for most stars, or 200 times, with factors of exposures of 200.
+    """
+    rng = np.random.default_rng(seed)
+    flux = 10 ** (0.4 * (11.5 - 7 * rng.power(2.2, 132)))
+    flux, exposure, factor = np.tile(flux, 5), np.repeat(np.arange(5), 132), np.array([0.9, 1.0, 1.1, 1.0, 1.0])
+    true = np.sqrt((4.75 / flux) ** 2 + 0.24**2 / flux + 0.008**2) * factor[exposure]
+    variance = true**2 * rng.exponential(size=len(true))
+    variance[np.argsort(flux)[:3]] *= 10
+    law, found, _ = ErrorLaw.likelier(flux, variance, exposure, np.ones(5))
+    assert_allclose(law.sigma(flux) * found[exposure], true, rtol=0.4)
+    assert_allclose(found, factor, rtol=0.15)
+    assert_allclose(np.mean(variance / (law.sigma(flux) * found[exposure]) ** 2), 1, rtol=0.02)
+
+
 def test_zero_points_of_lists_are_not_their_errors(tmp_path):
     """One exposure whose fluxes have another unit has the errors that it has without, wherever the law is applied."""
     table, _, poses = drawn(3, "by-brightness")

@@ -409,6 +409,13 @@ def test_bad_input_is_named(change, error, words):
         predict(**GOOD | change)
 
 
+def test_a_plan_advises_what_a_plan_can_state():
+    """No option of the command turns a camera or ties to a reference."""
+    words = " ".join(str(predict(**GOOD | {"dynamic": 0.1})).split())
+    assert "prior (--prior) or its size (--static-sigma), or, in Python, poses of a camera that is turned" in words
+    assert "between exposures" not in words
+
+
 def test_errors_of_a_solution_are_not_those_of_a_measurement():
     stars = predict(**GOOD).solution.stars
     with pytest.raises(InputError, match="errors of reference positions, not of single measurements: give sigma"):

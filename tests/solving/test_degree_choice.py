@@ -314,6 +314,46 @@ def test_a_mismatched_star_has_no_say():
         assert solve(matches, degree="auto").degree == 2
 
 
+def large_static(seed, n_stars=100, half=512.0, error=0.02):
+    """Five lists, two of them turned, of a large cubic static distortion, one observation each 0.3 to 0.9 px off.
+
+    Returns the matches and of which rows the position is wrong; of numpy alone.
+    """
+    rng, rows = np.random.default_rng(seed), []
+    stars, static = rng.uniform(-1.1 * half, 1.1 * half, (n_stars, 2)), rng.normal(0, 8, (7, 2))
+    for i, roll in enumerate((0, 90, 0, 90, 0)):
+        (c, s), shift = (np.cos(np.radians(roll)), np.sin(np.radians(roll))), rng.uniform(-140, 140, 2)
+        q = stars @ np.array([[c, s], [-s, c]]) + shift
+        x, y = q.T / half
+        modes = np.stack([x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], axis=1)
+        p = q + modes @ (static + rng.normal(0, 0.02, (7, 2))) + half - 0.5
+        seen = np.flatnonzero((np.abs(p - half) < half).all(axis=1))
+        xy = p[seen] + rng.normal(0, error, (len(seen), 2))
+        wrong = rng.integers(len(seen))
+        xy[wrong] += (2 * rng.integers(2, size=2) - 1) * rng.uniform(0.2, 0.6, 2)
+        rows += [(f"e{i}", j, *each, k == wrong) for k, (j, each) in enumerate(zip(seen, xy, strict=True))]
+    exposure, star, x, y, wrong = zip(*rows, strict=True)
+    errors = np.full(len(x), error)
+    table = Table({"exposure": exposure, "star": star, "x": x, "y": y, "x_err": errors, "y_err": errors})
+    return Matches.from_table(table, shape=(1024, 1024)), np.array(wrong)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_what_contradicts_is_found_beside_a_fit_with_its_plane_held_elsewhere(seed):
+    """Such a fit of the same degree has modes beyond it, and is no plain one: it ended in a traceback."""
+    matches, wrong = large_static(seed)
+    options = SolveOptions(degree=3, clip=None)
+    near = single_fit.estimate(matches, options, trial=True)
+    assert near.problem.prior_mean.shape[2] > near.problem.n_modes
+    clipped = replace(options, clip=5.0)
+    found = single_fit.estimate(matches, clipped, near=near, trial=True)
+    used = found.problem.in_table_order(found.used)
+    assert not used[wrong].any()
+    assert np.mean(used) > 0.95
+    scratch = single_fit.estimate(matches, clipped)
+    assert_allclose(found.chi2, scratch.chi2, rtol=0.1)
+
+
 def test_kept_out_stars_do_not_choose():
     """What validate keeps out is not in the folds either."""
     sim = simulate(40, 0.5, 0.5, n_exposures=5)

@@ -220,8 +220,13 @@ def test_what_the_default_degree_leaves_of_a_prior_is_said(caplog, degree, said)
 
 def test_prior_width_makes_sparse_fields_solvable():
     sim = simulate_matches(n_stars=8, n_exposures=12, seed=9)
-    with pytest.raises(SolveError, match=r"exp00 has 8 stars, fewer than the 10 modes of degree 3: .*at most 2 here"):
+    with pytest.raises(SolveError, match=r"exp00 has 8 stars, fewer than the 10 modes .*: .*at most 2 here.*--prior F"):
+        solve(sim.matches)
+    # whoever has a prior is told what that one lacks, and with it there is a solution
+    with pytest.raises(SolveError, match=r"exp00 has 8 stars, .*give the prior a finite sigma.*--prior-sigma evidence"):
         solve(sim.matches, prior=Prior(sim.truth.static))
+    solution = solve(sim.matches, prior=Prior(sim.truth.static, sigma="evidence"))
+    assert accuracy.bias(solution.estimate.positions, sim.truth.positions[solution.estimate.star_names]) < 0.3
     solution = solve(sim.matches, prior=Prior(sim.truth.static, sigma=0.9))
     assert accuracy.bias(solution.estimate.positions, sim.truth.positions[solution.estimate.star_names]) < 0.3
 

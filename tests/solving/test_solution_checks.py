@@ -268,10 +268,10 @@ def spoiled(kind):
         table["x"][exposure == 5] += rng.normal(0, 2.5 * SIGMA, np.sum(exposure == 5)) * u.pix
     elif kind == "completeness":
         table.remove_rows(np.flatnonzero(exposure == 5)[20:])
-    elif kind == "brightness":
+    elif kind in ("brightness", "brightness, faint"):
         table["flux"] = np.geomspace(1, 1000, 60)[table["star"]]
-        bright = table["flux"] > 100
-        table["x"][bright] += rng.normal(0, 1.5 * SIGMA, bright.sum()) * u.pix
+        wrong = table["flux"] < 10 if "faint" in kind else table["flux"] > 100
+        table["x"][wrong] += rng.normal(0, 1.5 * SIGMA, wrong.sum()) * u.pix
     return changed(matches, table)
 
 
@@ -287,6 +287,7 @@ def spoiled(kind):
         ("exposures", r"larger than those of the others in exp05 \(\d\.\d+ times\); look at the frame"),
         ("completeness", "exp05 has 20 of the"),
         ("brightness", "the brightest third"),
+        ("brightness, faint", "the faintest third"),
     ],
 )
 def test_what_is_wrong_is_seen_and_said(kind, words):

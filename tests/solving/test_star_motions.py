@@ -247,6 +247,18 @@ def test_the_common_rates_are_unknown_and_said():
     assert gauge.n_constraints == 40
 
 
+def test_what_of_motions_is_a_convention_stands_beside_them():
+    """In the print and with the table, not in the gauge alone: a common expansion passes for one of the stars."""
+    solution = solve(field(60).matches, motion="proper")
+    words = "motions up to common rates of shift, rotation and scale, not known without a reference (their mean is zero"
+    assert words in " ".join(str(solution).split())
+    assert solution.stars.meta["motions"].startswith(words)
+    assert solution.stars_at(2018.0).meta["motions"].startswith(words)
+    still = solve(field(60).matches, motion=None, errors="floor")
+    assert "motions" not in still.stars.meta
+    assert "common rates" not in str(still)
+
+
 def test_a_drift_of_the_nominal_poses_is_no_motion():
     """They come from where stars were matched; the motions of all stars are at rest in the mean, whatever they are."""
     sim = field(seed=3, sigma=0.02, motion=0.2)

@@ -481,7 +481,10 @@ class CombinedNights(ShownAsPrinted):
             scatter = ", ".join(f"{each:.2g} (degree {d})" for d, each in enumerate(self.scatter, self._modes.lowest))
             lines.append(f"Nights scatter by {scatter} px a coefficient.")
             drift = f"{self.rate:.2g} px a year, and wanders by {self.walk:.2g} px in the root of a year"
-            if self.drifts or len(self.nights) > 2:
+            if undated := [each.name for each in self.nights if each.date is None]:
+                have = "has" if len(undated) == 1 else "have"
+                lines.append(f"Change with time is not looked for: {some_of(undated, 6)} {have} no date.")
+            elif self.drifts or len(self.nights) > 2:
                 lines.append(f"A coefficient changes by {drift}." if self.drifts else "No change with time is seen.")
         lines += self._said_of_covariate()
         if np.any(own := self.exposure_scatter):

@@ -252,9 +252,9 @@ def brightness_check(solution, residuals):
     """Are the errors of bright and of faint stars right alike?"""
     table = solution.residuals
     if "flux" in table.colnames:
-        key, what = -np.asarray(table["flux"], dtype=float), "brightest"
+        key, ends = -np.asarray(table["flux"], dtype=float), ("brightest", "faintest")
     else:
-        key, what = np.hypot(table["x_err"].value, table["y_err"].value), "most precise"
+        key, ends = np.hypot(table["x_err"].value, table["y_err"].value), ("most precise", "least precise")
     key = key[residuals.problem.order]
     good = residuals.used & np.isfinite(key)
     if np.ptp(key[good]) == 0 or residuals.dof < 30:
@@ -269,7 +269,7 @@ def brightness_check(solution, residuals):
     # residuals do not show what neighbouring exposures share, least of all those of bright stars
     limit = (1 + NEGLIGIBLE) * (max(usual, 1.0) if solution.diagnostics.correlated else usual)
     state = state_of(s.p, s.rms > _star_error(residuals)) if ratios[worst] > limit else "pass"
-    which = f"{('the ' + what, 'the middle', 'the other')[worst]} third of the observations"
+    which = f"the {(ends[0], 'middle', ends[1])[worst]} third of the observations"
     if state == "pass":
         return Check("brightness", "pass", ratios[worst], None, "errors of bright and faint stars are right alike")
     return Check("brightness", state, ratios[worst], None,

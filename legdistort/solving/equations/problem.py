@@ -400,7 +400,7 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
         raise SolveError(
             f"exposure {name} has {count} stars, fewer than the {n_free} {'' if n_free == n_fit else 'free '}modes "
             f"of degree {degree}: "
-            f"lower the degree (at most {_highest_degree(count)} here), give a prior with sigma, "
+            f"lower the degree (at most {_highest_degree(count)} here), {_asked_of(priors[few[0]])}, "
             "or leave the exposure out (--without)",
             exposures=tuple(matches.names[i] for i in few),
         )
@@ -519,6 +519,13 @@ def _static_covariance(priors, degree):
         covariance = given[0].static_covariance_to(degree)
         return np.where(np.isinf(covariance), FREE**2, covariance)
     return np.diag(np.max([p.static_widths(degree) for p in given], axis=0).ravel() ** 2) if given else None
+
+
+def _asked_of(prior):
+    """What a prior of an exposure of few stars has to state, in words."""
+    if prior is None or prior.mean is None:
+        return "give a prior with sigma (--prior FILE --prior-sigma evidence)"
+    return "give the prior a finite sigma too, by which exposures scatter about it (--prior-sigma evidence)"
 
 
 def _highest_degree(count):

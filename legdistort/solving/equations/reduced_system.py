@@ -310,7 +310,7 @@ def _not_determined(problem, s, blocks):
         f"the observations do not determine the distortion of degree {problem.degree} "
         f"(smallest eigenvalue {values[0]:.1e} of the normalised equations), above all in exposure {worst}: "
         "leave out an exposure that hardly overlaps the others (--without), lower the degree, add stars, or give "
-        "a prior with sigma",
+        "a prior with sigma (--prior-sigma evidence)",
         exposures=tuple(problem.names[i] for i in theirs),
     )
 
