@@ -137,11 +137,11 @@ class TestFluxScale:
 
     def test_bad_input(self):
         known = {name: plain()[0][name] for name in ("frame0", "frame1")}
-        with pytest.raises(InputError, match="scale='stars': the solution has no fluxes of 5 common stars"):
+        with pytest.raises(InputError, match="scale='stars': the solution has no fluxes of stars; give"):
             flux_scales(blank(2), "stars", known)
         apart = observed([1.0, 1.0], seen=1.0)
         apart = apart[(apart["exposure"] == "frame0") == (apart["star"] < 30)]
-        with pytest.raises(InputError, match="that join all exposures"):
+        with pytest.raises(InputError, match=r"no 5 common stars .* apart are frame0; frame1"):
             flux_scales(blank(2), "stars", views(apart))
         with pytest.raises(
             InputError, match=r"scale must be one of 'auto', 'exptime', 'stars', None or a dict .* 'sky'"
