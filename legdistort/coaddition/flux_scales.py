@@ -67,7 +67,7 @@ def _factors(frames, scale, views, areas):
     stars = _star_scales(views, place, areas)
     unknown = NO_FLUXES if stars is None else stars.apart(exposures)
     if unknown and scale == "stars":
-        raise InputError(f"scale='stars': {unknown}; give scale='exptime' or a dict by exposure")
+        raise InputError(f"scale='stars': {unknown}; give scale={{name: factor}} or scale='exptime' (--scale exptime)")
     times = _times(first)
     if unknown:
         if len(exposures) > 1:
@@ -108,8 +108,8 @@ def _time_scales(frames, times):
     if None in times:
         missing = ", ".join(f.name for f in frames if not f.exposure_time)
         warn(
-            f"no exposure time known for {missing}: the exposures are taken to be equally long; "
-            "give scale={name: factor} if they are not",
+            f"no exposure time known for {missing}: the exposures are taken to be equally long; if they are "
+            "not, state EXPTIME in the headers, or give scale={name: factor} or scale='stars' (--scale stars)",
             AssumptionWarning,
         )
         return same

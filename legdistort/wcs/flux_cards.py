@@ -41,7 +41,8 @@ class FluxCards:
         if self.factors.unknown:
             log.warning(
                 "no FLXSCALE in the texts: %s; SWarp adds their values as they are, whatever exposure times and "
-                "transparency", self.factors.unknown,
+                "transparency, unless it is given factors of the files in their order, such as the mean exposure time "
+                "over that of each (-FSCALE_DEFAULT 1.2,0.8,...)", self.factors.unknown,
             )  # fmt: skip
             return
         scales = [self.factors.of(view.name, view.detector) for view in views]

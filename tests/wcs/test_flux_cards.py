@@ -84,6 +84,7 @@ def test_where_no_fluxes_tell_it_no_text_has_it(one, tmp_path, caplog, known, wh
     said = [each.message for each in caplog.records if "no FLXSCALE in the texts" in each.message]
     assert len(said) == 1
     assert why in said[0]
+    assert "-FSCALE_DEFAULT" in said[0]
 
 
 def test_fluxes_of_stars_are_on_one_scale(one):
