@@ -17,7 +17,7 @@ from ..exceptions import InputError
 from ..inputs import column_contract
 from ..inputs.detector_files import warn_of_detectors
 from ..inputs.star_lists.formats import stack
-from ..inputs.table_files import named_after, named_as_known, names_of_images, records, shapes_for_match, write_stars
+from ..inputs.table_files import named_after, names_of_images, records, shapes_for_match, write_stars
 from ..results.check import WRONG, Check, worst
 from ..runtime import outputs, parallel, provenance
 from ..runtime.trees.codec import from_tree
@@ -30,7 +30,6 @@ from .given_files import (
     given_solving,
     grid_in,
     known_file,
-    read_given,
     read_lists,
     read_matches,
     refuse,
@@ -38,7 +37,7 @@ from .given_files import (
     without_options_of_prior,
 )
 from .repeating import again, repeatable
-from .static_lists import asked_for, given_static
+from .static_lists import asked_for, given_static, lists_of
 
 #: What belongs to a reference.
 _TYING = ("reference_error", "reference_degree", "epoch")
@@ -419,11 +418,8 @@ def do_correct(a):
         refuse({"epoch": a.epoch, "max_bytes": a.max_bytes}, "is for a solution")
         table, said, figures = static.corrected(a)
     else:
-        of_camera = {"detector": a.detector, "date": a.date, "value": a.value}
-        refuse(of_camera, "is for the lists of a camera")
         solution, said, figures = _solution(a), "", {}
-        lists = [named_as_known(read_given(path, a), path, solution.names) for path in a.tables]
-        table = solution.correct_table(stack(lists), epoch=a.epoch)
+        table = solution.correct_table(lists_of(solution, a), epoch=a.epoch)
     write_by_ending(table, a.out, overwrite=a.overwrite)
     _say(a, f"{len(table)} positions in {a.out}{said}", {"n_positions": len(table), "out": str(a.out)} | figures)
 

@@ -71,7 +71,9 @@ def with_earlier(arguments):
     names = [flag.removeprefix("--") for flag in kept]
     for name in set(arguments.forget) - {*names, "all"}:
         known = some_of(names, 9) or "none"
-        raise InputError(f"--forget {name} is none of the options of {earlier}, which are {known}")
+        measured = "; the camera is that of the frames as they were measured: run them anew without it"
+        measured *= name == "camera"
+        raise InputError(f"--forget {name} is none of the options of {earlier}, which are {known}{measured}")
     given = {word.partition("=")[0] for word in arguments.argv if word.startswith("--")}
     dropped = {flag for flag in kept if "all" in arguments.forget or flag.removeprefix("--") in arguments.forget}
     if "--no-mosaic" in given:

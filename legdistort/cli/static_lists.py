@@ -1,13 +1,19 @@
-"""Lists of positions that a camera, or another known static distortion, corrects without a solution."""
+"""Lists of positions that a solution corrects, or without one a camera, or another known static distortion."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
 
 import legdistort
 
 from ..exceptions import InputError, some_of
+from ..inputs import column_contract
+from ..inputs.exposure_names import detector_name
 from ..inputs.star_lists.formats import stack
-from ..inputs.table_files import told_apart
+from ..inputs.table_files import named_after, named_as_known, told_apart
 from ..runtime.asdf_files import entry_of, read_tree
 from .given_files import read_given, refuse, without_options_of_prior
 
@@ -37,14 +43,12 @@ class GivenStatic:
     def corrected(self, a):
         """The lists of a command line, one below the other, corrected; in words by what and how well; the figures."""
         lists = told_apart([(Path(path), read_given(path, a)) for path in a.tables])
-        if a.detector is not None:
-            if not isinstance(self.known, legdistort.Camera):
-                raise InputError("--detector is for a camera: leave it out, this static distortion is of one detector")
-            self.known[a.detector]  # refuses an unknown one
+        camera = self.known if isinstance(self.known, legdistort.Camera) else None
         made = []
         for path, table in lists.items():
+            named = with_detectors(table, path, camera, a.detector)
             try:
-                made.append(self._corrected(table, a.detector))
+                made.append(self.known.correct_table(named, **self.scatter))
             except InputError as error:
                 raise InputError(f"{path}: {error}") from None
         bare = [str(path) for path, table in lists.items() if "x_err" not in table.colnames]
@@ -54,13 +58,6 @@ class GivenStatic:
         if bare:
             words += f"; {some_of(bare, _MOST_NAMED)} without errors of the positions, which x_err leaves out: --error"
         return out, words, {name: out.meta[name] for name in _FIGURES}
-
-    def _corrected(self, table, detector):
-        if detector is not None:
-            if "detector" in table.colnames:
-                raise InputError("it has a column detector, which says it of every row: leave --detector out")
-            table["detector"] = detector
-        return self.known.correct_table(table, **self.scatter)
 
     def _described(self, table):
         """What corrected the positions of a table, and how good it is there."""
@@ -73,6 +70,71 @@ class GivenStatic:
         about = f"exposures scatter about it by {scatter or 0:.2g} px"
         about = about if scatter else "how far exposures scatter about it is not stated"
         return f", without the static distortion of {self.what}, which {said}; {about}"
+
+
+def with_detectors(table, path, camera, detector=None, names=None):
+    """The table of a file with the detector of every row, as `match` has it with frames: by name, image, or as given.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+    path : str or path
+        Of its file, for messages.
+    camera : Camera or None
+    detector : str, optional
+        Of all rows, which ``--detector`` gives.
+    names : sequence of str, optional
+        Of the exposures that are known. Without them any is: ``a03-CCD1`` and the images ``a03_1``, ``a03_2`` of an
+        LDAC list are of ``a03``.
+
+    Raises
+    ------
+    InputError
+        For a detector where there are none, or where the table has its own; if what images are of cannot be told.
+    """
+    if detector is not None:
+        if camera is None:
+            raise InputError("--detector is for a camera: leave it out, this static distortion is of one detector")
+        camera[detector]  # refuses an unknown one
+        if "detector" in table.colnames:
+            raise InputError(f"{path}: it has a column detector, which says it of every row: leave --detector out")
+        if len(images := table.meta.get("images", {})) > 1:
+            raise InputError(f"{path}: it has tables of {len(images)} images, each a detector: leave --detector out")
+        table["detector"] = detector
+        return table
+    if (
+        camera is None
+        or not camera.has_focal_plane
+        or "detector" in table.colnames
+        or not {"exposure", "x", "y"} <= set(table.colnames)
+    ):
+        return table
+    ids = list(camera.detectors)
+    if names is None:
+        ends = "|".join(re.escape(detector_name("", key)) for key in ids)
+        ends = rf"(?:{ends}|_\d+)$" if table.meta.get("images") else rf"(?:{ends})$"
+        names = {re.sub(ends, "", name) for name in np.unique(column_contract.labels(table, "exposure")).tolist()}
+    parts = [
+        SimpleNamespace(name=detector_name(name, key), exposure=name, detector=key) for name in names for key in ids
+    ]
+    table = named_after(table, parts, path)
+    if "detector" not in table.colnames:
+        raise InputError(
+            f"{path}: the list has no column detector, which of {some_of(ids, 8)} of camera {camera.name} it is of: "
+            f"add it, or call the list as {parts[0].name}; for lists of one of them, --detector {ids[0]}"
+        )
+    return table
+
+
+def lists_of(solution, a):
+    """The lists of a command line, one below the other, with the exposures and detectors of a solution."""
+    of_camera = {} if solution.camera.has_focal_plane else {"detector": a.detector}
+    refuse(of_camera | {"date": a.date, "value": a.value}, "is for the lists of a camera")
+    lists = []
+    for path in a.tables:
+        table = named_as_known(read_given(path, a), path, solution.names)
+        lists.append(with_detectors(table, path, solution.camera, a.detector, solution.names))
+    return stack(lists)
 
 
 def given_static(where, a):

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..cameras.star_scales import FEW, star_scales
+from ..cameras.star_scales import NO_FLUXES, star_scales
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..inputs.exposure_names import whole_name
 from ..inputs.frames.integrations import value_time
@@ -65,13 +65,13 @@ def _factors(frames, scale, views, areas):
     place = np.array([(exposures.index(whole_name(f)), detectors.index(f.detector)) for f in frames])
     first = [frames[k] for k in np.unique(place[:, 0], return_index=True)[1]]
     stars = _star_scales(views, place, areas)
-    if stars is None and scale == "stars":
-        raise InputError(
-            f"scale='stars': the solution has no fluxes of {FEW} common stars or more that join all exposures; "
-            "give scale='exptime' or a dict by exposure"
-        )
+    unknown = NO_FLUXES if stars is None else stars.apart(exposures)
+    if unknown and scale == "stars":
+        raise InputError(f"scale='stars': {unknown}; give scale={{name: factor}} or scale='exptime' (--scale exptime)")
     times = _times(first)
-    if stars is None:
+    if unknown:
+        if len(exposures) > 1:
+            log.info("exposures are scaled by exposure times, whatever their transparency: %s", unknown)
         return _time_scales(first, times)[place[:, 0]], "exptime"
     sensitive = scale == "stars" or np.any(np.abs(stars.detectors) > 3 * stars.detector_errors)
     of_detectors = np.exp(stars.detectors) if sensitive else np.ones(len(detectors))
@@ -108,8 +108,8 @@ def _time_scales(frames, times):
     if None in times:
         missing = ", ".join(f.name for f in frames if not f.exposure_time)
         warn(
-            f"no exposure time known for {missing}: the exposures are taken to be equally long; "
-            "give scale={name: factor} if they are not",
+            f"no exposure time known for {missing}: the exposures are taken to be equally long; if they are "
+            "not, state EXPTIME in the headers, or give scale={name: factor} or scale='stars' (--scale stars)",
             AssumptionWarning,
         )
         return same

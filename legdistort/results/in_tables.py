@@ -47,7 +47,7 @@ def stars(solution, time=None):
         table["group"][index] = solution.camera.group_of(used)
     factors = flux_factors(solution)
     if "flux" in used.colnames:
-        flux = used["flux"] if factors is None else used["flux"] * factors.of_rows(used, solution.camera)
+        flux = used["flux"] * factors.of_rows(used, solution.camera)
         with np.errstate(invalid="ignore"):
             table["flux"] = np.bincount(index, flux, len(table)) / table["n"]
     obstime = None if at is None else Time(at, format="jyear")
@@ -61,7 +61,7 @@ def stars(solution, time=None):
             moving = {"pm_ra_cosdec": table["pmra"], "pm_dec": table["pmdec"]}
             table["sky"] = SkyCoord(table["ra"], table["dec"], **moving, frame="icrs", obstime=obstime)
     table.meta = _meta(solution) | {"epoch": at}
-    return column_contract.describe_stars(table, one_scale=factors is not None)
+    return column_contract.describe_stars(table, one_scale=not factors.unknown)
 
 
 def _along_paths(solution, time):

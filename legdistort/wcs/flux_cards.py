@@ -7,7 +7,7 @@ from typing import Any
 
 from astropy.io import fits
 
-from ..cameras.star_scales import FEW, flux_factors
+from ..cameras.star_scales import flux_factors
 
 log = logging.getLogger(__name__)
 
@@ -20,12 +20,12 @@ class FluxCards:
 
     @cached_property
     def factors(self):
-        """`~legdistort.cameras.star_scales.FluxFactors`, or None."""
+        """`~legdistort.cameras.star_scales.FluxFactors`; without any, why there are none."""
         return flux_factors(self.solution)
 
     def of(self, view):
         """Header with the card of an image; empty where nothing tells it."""
-        if self.factors is None:
+        if self.factors.unknown:
             return fits.Header()
         return fits.Header([("FLXSCALE", self.factors.of(view.name, view.detector), "by stars, to the mean depth")])
 
@@ -38,10 +38,11 @@ class FluxCards:
                 "RESULTS brings it into their solution, and attach --head writes the texts of all of them"
             )
             return
-        if self.factors is None:
+        if self.factors.unknown:
             log.warning(
-                "no FLXSCALE in the texts: the solution has no fluxes of %d common stars or more that join all "
-                "exposures; SWarp adds their values as they are, whatever exposure times and transparency", FEW,
+                "no FLXSCALE in the texts: %s; SWarp adds their values as they are, whatever exposure times and "
+                "transparency, unless it is given factors of the files in their order, such as the mean exposure time "
+                "over that of each (-FSCALE_DEFAULT 1.2,0.8,...)", self.factors.unknown,
             )  # fmt: skip
             return
         scales = [self.factors.of(view.name, view.detector) for view in views]

@@ -71,6 +71,26 @@ def test_fluxes_of_detectors_are_on_one_scale(gsaoi):
     np.testing.assert_allclose(product / np.median(product), 1, atol=0.005)
 
 
+def test_lists_of_one_detector_in_the_shell(solution, table, tmp_path, monkeypatch, capsys):
+    """By the label that the solution gives an image, or by --detector; the stars are those of the list."""
+    monkeypatch.chdir(tmp_path)
+    solution.write("night.asdf")
+    name = str(solution.names[3])
+    rows = table[(np.asarray(table["exposure"]) == name) & (np.asarray(table["detector"]).astype(str) == "2")]
+    plain = rows["x", "y", "x_err", "y_err"]
+    for path, more in ((f"{name}-2.ecsv", []), (f"{name}.ecsv", ["--detector", "2"])):
+        plain.write(path)
+        assert main(["correct", "night.asdf", path, *more, "--out", "out.ecsv", "--overwrite"]) == 0
+        made = QTable.read("out.ecsv")
+        assert len(made) == len(rows) > 20
+        assert np.mean(np.asarray(made["star"]) == np.asarray(rows["star"])) > 0.9
+    capsys.readouterr()
+    assert main(["correct", "night.asdf", f"{name}.ecsv", "--out", "out.ecsv", "--overwrite"]) == 1
+    said = capsys.readouterr().err
+    assert f"{name}.ecsv: the list has no column detector, which of 1, 2, 3, 4 of camera" in said
+    assert "--detector 1" in said
+
+
 def pixels(n=12, size=gsaoi_images.SIZE):
     t = np.linspace(-0.5, size - 0.5, n)
     return np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)

@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 from astropy import units as u
-from astropy.table import Table
+from astropy.io import fits
+from astropy.table import QTable, Table
 from numpy.polynomial import legendre
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -307,6 +308,46 @@ def test_a_list_of_one_of_several_detectors(folder, capsys, tmp_path):
     assert "), written 20" in said
     expected = pair().correct_table(listed(places(5), 0.02, detector=["b"] * 5))
     assert_allclose(Table.read(tmp_path / "out.ecsv")["x"], expected["x"].value)
+
+
+def ldac(path, **tables):
+    """As SExtractor writes it of a frame with extensions, counted from 1: before each table the header of the image."""
+    hdus = [fits.PrimaryHDU()]
+    for name, table in tables.items():
+        text = fits.Header({"NAXIS1": SHAPE[1], "NAXIS2": SHAPE[0], "EXTNAME": name}).tostring(padding=False)
+        cards = np.array([[text[k : k + 80] for k in range(0, len(text), 80)]], dtype="S80")
+        card = fits.Column("Field Header Card", f"{len(text)}A", array=cards, dim=f"(80, {len(text) // 80})")
+        hdus += [
+            fits.BinTableHDU.from_columns([card], name="LDAC_IMHEAD"),
+            fits.BinTableHDU(table, name="LDAC_OBJECTS"),
+        ]
+    fits.HDUList(hdus).writeto(path)
+    return path
+
+
+def of_sextractor(xy, error):
+    columns = {"XWIN_IMAGE": xy[:, 0] + 1, "YWIN_IMAGE": xy[:, 1] + 1}
+    n = len(xy)
+    return Table(columns | {"ERRAWIN_IMAGE": [error] * n, "ERRBWIN_IMAGE": [error] * n, "ERRTHETAWIN_IMAGE": [0.0] * n})
+
+
+def test_lists_name_their_detectors_as_those_of_match(folder, tmp_path, monkeypatch, capsys):
+    """An LDAC list of several images, in another order than the camera's; a list that is called as an image."""
+    monkeypatch.chdir(tmp_path)
+    xy = {"b": places(4, seed=5), "a": places(3, seed=6)}
+    ldac("n1.ldac", **{key: of_sextractor(each, 0.02) for key, each in xy.items()})
+    listed(xy["b"], 0.02).write("n1-b.ecsv")
+    layouts, distortions = {key: pair()[key].layout for key in "ab"}, {"a": STATIC, "b": -STATIC}
+    for name, keys in (("n1.ldac", "ba"), ("n1-b.ecsv", "b")):
+        assert main(["correct", str(folder / "pair.asdf"), name, "--out", "out.ecsv", "--overwrite"]) == 0
+        made = QTable.read("out.ecsv")
+        assert made["detector"].tolist() == [key for key in keys for _ in xy[key]]
+        for key in keys:
+            layout, found = layouts[key], xy_of(made[made["detector"] == key])
+            q = found @ layout[:, :2].T + layout[:, 2]
+            assert_allclose(distort(q, distortions[key]), xy[key], atol=1e-6)
+    assert main(["correct", str(folder / "pair.asdf"), "n1.ldac", "--detector", "a", "--out", "o.ecsv"]) == 1
+    assert "n1.ldac: it has tables of 2 images, each a detector: leave --detector out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -134,6 +134,7 @@ def test_a_run_goes_on_with_what_it_was_told(tmp_path, capsys, monkeypatch):
     ("words", "message"),
     [
         (["--from", "first", "--forget", "clip"], "--forget clip is none of the options of first, which are degree"),
+        (["--from", "first", "--forget", "camera"], "frames as they were measured: run them anew without it"),
         (["a.fits", "--forget", "clip"], "--forget is for options of the run of --from: leave it out"),
         (["a.fits", "--no-mosaic", "--combine", "median"], "--combine is for a mosaic, and --no-mosaic wants none"),
     ],

@@ -18,6 +18,7 @@ from reproject import reproject_interp
 from scipy.spatial import Delaunay
 from stacks import SHAPE, SIGMA, StandIn, check_stars, covered, expose, fit_star, plain, scene, star_image
 
+from legdistort.cli.running import in_shell_words
 from legdistort.coaddition.background import measure_background
 from legdistort.coaddition.combination import PixelFlag
 from legdistort.coaddition.flux_scales import flux_scales
@@ -125,8 +126,9 @@ class TestFluxScale:
             factors, origin = flux_scales(frames, "auto", seen)
         assert origin == "stars"
         assert factors["frame0"] / factors["frame1"] == pytest.approx(3, rel=0.03)
-        with warns_here(AssumptionWarning, match="no exposure time known for frame1"):
+        with warns_here(AssumptionWarning, match="no exposure time known for frame1") as caught:
             assert flux_scales(frames, "exptime", seen)[0]["frame0"] == 1
+        assert in_shell_words(str(caught[-1].message)).endswith("in the headers, or give --scale stars")
 
     def test_exposures_are_joined_through_others(self):
         table = observed([1.0, 2.0, 4.0], seen=1.0, outliers=0)
@@ -137,11 +139,12 @@ class TestFluxScale:
 
     def test_bad_input(self):
         known = {name: plain()[0][name] for name in ("frame0", "frame1")}
-        with pytest.raises(InputError, match="scale='stars': the solution has no fluxes of 5 common stars"):
+        with pytest.raises(InputError, match="scale='stars': the solution has no fluxes of stars; give") as error:
             flux_scales(blank(2), "stars", known)
+        assert in_shell_words(str(error.value)).endswith("no fluxes of stars; give --scale exptime")  # no dicts there
         apart = observed([1.0, 1.0], seen=1.0)
         apart = apart[(apart["exposure"] == "frame0") == (apart["star"] < 30)]
-        with pytest.raises(InputError, match="that join all exposures"):
+        with pytest.raises(InputError, match=r"no 5 common stars .* apart are frame0; frame1"):
             flux_scales(blank(2), "stars", views(apart))
         with pytest.raises(
             InputError, match=r"scale must be one of 'auto', 'exptime', 'stars', None or a dict .* 'sky'"

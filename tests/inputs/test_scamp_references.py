@@ -48,3 +48,35 @@ def test_an_error_of_nothing_names_its_cure(tmp_path):
     table = QTable({"ra": [150.0] * u.deg, "dec": [2.0] * u.deg, "ra_error": [1.0] * u.mas, "dec_error": [0.0] * u.mas})
     with pytest.raises(InputError, match="dec_error must be positive, got 0 in row 0; one not known is NaN, or empty"):
         read_reference(table)
+
+
+@pytest.mark.parametrize("unknown", [[0.0, 0.0, 0.0], [0.0, 1761.6, 2024.1], [0.0, np.nan, 2024.1]])
+def test_epochs_that_scamp_does_not_know_count_as_none(tmp_path, unknown):
+    """It writes 0 for stars that it has once, and means of years with zeros."""
+    table = QTable.read(written(tmp_path / "known.fits"))
+    table["EPOCH"] = unknown * u.yr
+    table.write(tmp_path / "merged_1.fits")
+    known = read_reference(tmp_path / "merged_1.fits")
+    assert len(known) == 3
+    if np.max(unknown) == 0:
+        assert known.epoch is None
+    else:
+        np.testing.assert_array_equal(known.epoch, [np.nan, np.nan, 2024.1])
+        assert_allclose(known.at(2024.1, moving=True).sky, [[150.02, 2.02]])
+
+
+def test_motions_without_an_epoch_are_left_out_by_count(caplog):
+    caplog.set_level("INFO")
+    rows = {
+        "ra": [150.0, 150.01, 150.02] * u.deg,
+        "dec": [2.0, 2.01, 2.02] * u.deg,
+        "ref_epoch": [0, 2016, np.nan] * u.yr,
+    }
+    places = {f"{name}_error": [1.0] * 3 * u.mas for name in ("ra", "dec")}
+    motions = {name: [1.0] * 3 * u.mas / u.yr for name in ("pmra", "pmdec", "pmra_error", "pmdec_error")}
+    known = read_reference(QTable(rows | places | motions))
+    assert_allclose(known.sky, [[150.01, 2.01]])
+    assert "2 of 3 stars are left out, whose motions have no epoch" in caplog.text
+    rows["ref_epoch"] = [0, 57388.5, np.nan] * u.yr
+    with pytest.raises(InputError, match=r"ref_epoch must be the years .* got 57388.5 in row 1, and no year in any"):
+        read_reference(QTable(rows | places | motions))

@@ -3,6 +3,7 @@
 import re
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import four_detectors
 import header_layouts
@@ -15,6 +16,7 @@ from legdistort.cameras import ties
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortWarning
 from legdistort.geometry.similarity import apply, fit_similarity
 from legdistort.solving.camera_fit import in_camera
+from legdistort.solving.checks import cures
 
 STATES = ("camera", "absolute")
 
@@ -71,6 +73,22 @@ def test_the_check_says_how_far_headers_have_each_detector(far, solution):
     assert float(told[1]) == pytest.approx(off.max(), abs=1.5)
     each = dict(word.split() for word in told[2].split(", "))
     np.testing.assert_allclose([float(each[key]) for key in header_layouts.KEYS], off, atol=1.5)
+
+
+def test_no_cure_is_what_is_fitted_already(monkeypatch):
+    """A wrong layout that is held is named with --layout fit; the same residuals of a fitted one name none."""
+    tried, night = [], header_layouts.Night(11, off=0.03, dither=200.0, n=6, n_stars=300, size=0.0)
+    matches = legdistort.match(night.table, exposures=night.exposures)
+    effects_in = cures.effects_in
+    monkeypatch.setattr(cures, "effects_in", lambda *words: tried.append(words) or effects_in(*words))
+    held = legdistort.solve(matches, degree=1, layout="hold")
+    assert {check.cure for check in held.checks if check.name in ("chi2", "place", "degree")} == {"--layout fit"}
+    (residuals, observed, errors), free = tried[0], np.zeros((4, 2, 10), dtype=bool)
+    assert errors is None or not errors.free[:, :, :3].any()
+    free[:, :, :3] = True
+    found = effects_in(residuals, observed, SimpleNamespace(free=free))
+    assert "--layout fit" not in [each.effect.cure for each in found]
+    assert "--layout fit" in [each.effect.cure for each in effects_in(residuals, observed, SimpleNamespace(free=~free))]
 
 
 @pytest.mark.slow

@@ -74,14 +74,17 @@ def test_one_exposure_alone_says_what_brings_it_to_the_scale_of_others(one, tmp_
     assert "solve --base RESULTS brings it into their solution" in caplog.text
 
 
-@pytest.mark.parametrize("known", [{"flux": False}, FEW])
-def test_where_no_fluxes_tell_it_no_text_has_it(one, tmp_path, caplog, known):
+@pytest.mark.parametrize(
+    ("known", "why"), [({"flux": False}, "the solution has no fluxes of stars"), (FEW, "no 5 common stars")]
+)
+def test_where_no_fluxes_tell_it_no_text_has_it(one, tmp_path, caplog, known, why):
     solution, _ = solved(one, **known)
     attach(solution, frames(tmp_path, solution.names), kind="head", out=tmp_path / "heads")
     assert not any("FLXSCALE" in cards(path) for path in (tmp_path / "heads").iterdir())
     said = [each.message for each in caplog.records if "no FLXSCALE in the texts" in each.message]
     assert len(said) == 1
-    assert "5 common stars" in said[0]
+    assert why in said[0]
+    assert "-FSCALE_DEFAULT" in said[0]
 
 
 def test_fluxes_of_stars_are_on_one_scale(one):
@@ -116,7 +119,8 @@ def test_exposures_in_a_chain_and_groups_of_detectors():
     assert found.detectors[2] == 0
     assert np.isinf(found.detector_errors).tolist() == [False, False, True]
     apart = exposure < 15
-    assert star_scales(exposure, detector, np.where(apart, star, star + 10**6), np.exp(logs), n, 3) is None
+    found = star_scales(exposure, detector, np.where(apart, star, star + 10**6), np.exp(logs), n, 3)
+    assert (found.group == found.group[0]).tolist() == [i < 15 for i in range(n)]
 
 
 def test_errors_are_those_of_the_factors():

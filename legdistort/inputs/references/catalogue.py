@@ -4,6 +4,7 @@ Columns are those of Gaia (also as VizieR writes them), or ``x``, ``y`` in the r
 of stars of solutions. Where a table has both, the sky is taken.
 """
 
+import logging
 import re
 import warnings
 from dataclasses import dataclass, replace
@@ -26,6 +27,8 @@ from .. import column_contract
 from ..plain_columns import is_text, numbers, text
 from ..table_files import read_table
 from .scamp import of_scamp
+
+log = logging.getLogger(__name__)
 
 #: How VizieR calls the columns of Gaia, and places in the tables of others, in small letters.
 VIZIER = {
@@ -84,7 +87,7 @@ class Reference:
     motion : ndarray, shape (n, k), or None
         Proper motions to the east and north, mas a year, or along x and y, pixels a year; perhaps parallaxes, mas.
     epoch : ndarray, shape (n,), or None
-        Years of the positions.
+        Years of the positions; NaN for those not known, of which none has a motion.
     finds_errors : bool
         Whether the errors are known up to a common factor only, which is to be found.
     maps : ndarray, shape (n, 2, m), or None
@@ -142,9 +145,10 @@ class Reference:
             if near is False:
                 return self
             if not near.any():
+                own = np.nanmedian(self.epoch)
                 raise InputError(
-                    f"{self.label} has no proper motions, and its positions are those of {np.median(self.epoch):.2f}, "
-                    f"where stars that move are sought at {epoch:.2f}: give motion_epoch={np.median(self.epoch):.2f} "
+                    f"{self.label} has no proper motions, and its positions are those of {own:.2f}, "
+                    f"where stars that move are sought at {epoch:.2f}: give motion_epoch={own:.2f} "
                     "(--motion-epoch), or the proper motions"
                 )
             return self.subset(near)
@@ -268,6 +272,9 @@ def read_reference(reference, error=None, degree=None):
         raise InputError(f"{label}: {error}" if label not in str(error) else str(error)) from None
     positions = made.sky if celestial else made.xy
     good = np.isfinite(positions).all(axis=1) & np.isfinite(made.covariance[:, :2, :2]).all(axis=(1, 2))
+    if made.motion is not None and (n := np.count_nonzero(good & np.isnan(made.epoch))):
+        log.info("%s: %d of %d stars are left out, whose motions have no epoch (ref_epoch)", label, n, len(good))
+        good &= np.isfinite(made.epoch)
     if not good.any():
         raise InputError(f"{label} has no row with finite positions and errors ({len(good)} rows)")
     if made.star is not None and len(np.unique(made.star[good])) < np.count_nonzero(good):
@@ -382,7 +389,7 @@ def _moving(table, places, motions, unit, label):
     moving = [name in table.colnames for name in motions]
     if not any(moving):
         dated = "ref_epoch" in table.colnames or not {"ref_epoch", "epoch"}.isdisjoint(table.meta)
-        epoch = _epochs(table, label) if dated else None
+        epoch = _epochs(table, label, moving=False) if dated else None
         return None, epoch, _covariance(table, _errors(table, places, unit, label), places)
     if not all(moving):
         raise InputError(f"one of {motions[0]}, {motions[1]} is missing")
@@ -390,7 +397,7 @@ def _moving(table, places, motions, unit, label):
         motions = (*motions, "parallax")
     motion = np.column_stack([column_contract.values(table, name, _UNITS[name]) for name in motions])
     _doubt_units(table, motions[:2], motion[:, :2], label)
-    epoch = _epochs(table, label)
+    epoch = _epochs(table, label, moving=True)
     parts = ((places, unit), (motions[:2], unit / u.yr), (motions[2:], unit))
     errors = np.hstack([_errors(table, names, of, label) for names, of in parts if names])
     return motion, epoch, _covariance(table, errors, (*places, *motions))
@@ -492,7 +499,8 @@ def _covariance(table, errors, names):
     return out
 
 
-def _epochs(table, label):
+def _epochs(table, label, moving):
+    """Years (n,) of the positions of a table, NaN for those that are not known; None if none is, unless they move."""
     if "ref_epoch" not in table.colnames and "epoch" in table.meta:  # a table of stars of a solution
         return np.full(len(table), year(table.meta["epoch"]))
     if "ref_epoch" not in table.colnames and "ref_epoch" not in table.meta:
@@ -504,12 +512,23 @@ def _epochs(table, label):
         return np.full(len(table), year(table.meta["ref_epoch"]))
     column = table["ref_epoch"]
     out = column.jyear if isinstance(column, Time) else column_contract.values(table, "ref_epoch", u.yr)
-    for row in {int(np.nanargmin(out)), int(np.nanargmax(out))} if np.isfinite(out).any() else ():
-        try:
-            year(float(out[row]))
-        except InputError as error:
-            raise InputError(f"ref_epoch in row {row}: {error}") from None
-    return out
+    known = np.array([_is_year(value) for value in out.tolist()], dtype=bool)
+    if moving and not known.any():
+        row = int(np.argmax(np.nan_to_num(np.abs(out))))
+        raise InputError(
+            f"ref_epoch must be the years of its positions, which have proper motions (2016.0 for Gaia DR3), got "
+            f"{out[row]:g} in row {row}, and no year in any"
+        )
+    return np.where(known, out, np.nan) if known.any() else None
+
+
+def _is_year(value):
+    """Whether a number is the year of something: unknown ones are NaN, or 0 as SCAMP has them, or its means with 0."""
+    try:
+        year(value)
+    except InputError:
+        return False
+    return True
 
 
 def _names(table):

@@ -11,7 +11,7 @@ from ...exceptions import some_of
 from ...geometry import similarity
 from ...matching.detectors.detector_places import REACH, TURNS
 from ...results.check import WRONG, Check, FactorTest, state_of
-from .known_effects import DEPARTURES, LAYOUT, STATICS
+from .known_effects import DEPARTURES, LAYOUT, STATICS, fitted_already
 from .limits import MOST_NAMED, SEEN, addition_that_shows, as_one
 
 #: Stars that cross, from which on it tells something that they are left out.
@@ -71,7 +71,7 @@ def camera_check(solution, residuals, observed, *, camera, contradicted, error, 
     if observed.detector is None or residuals.dof < 1:
         return None
     free = np.zeros(4, dtype=bool) if camera is None else camera.free.any(axis=(0, 1))
-    held = {LAYOUT: not free[:3].any(), STATICS: not free[3:].any()}
+    held = {effect: not fitted for effect, fitted in fitted_already(camera).items()}
     held = [effect for effect, is_held in held.items() if is_held]
     stated, apart = _stated(solution, camera and camera.departure), undetermined(solution)
     headers = _headers_by_group(solution) if apart else _headers(solution, free[:3].any())

@@ -77,7 +77,7 @@ def with_cures(checks, solution, residuals, observed, judged):
         higher, ends, after = _higher_degree(residuals, static)
         if ends and judged(after)["chi2"].state not in WRONG:  # then it is the degree and no more
             return _with_static_degree(checks, _or_layout(solution, higher))
-    effects = effects_in(residuals, observed)
+    effects = effects_in(residuals, observed, solution.estimate.uncertainty.camera)
     checks, explained = _named(checks, effects, judged, static=solution.settings.static)
     wrong = [name for name, check in checks.items() if check.state in WRONG and name not in explained]
     if not wrong:

@@ -228,19 +228,28 @@ class Found:
     left: object
 
 
-def effects_in(residuals, observed):
+def fitted_already(errors):
+    """Effects of which the solution has unknowns, by its `CameraErrors`: its residuals show something else by them."""
+    free = np.zeros(4, dtype=bool) if errors is None else errors.free.any(axis=(0, 1))
+    return {LAYOUT: free[:3].any(), STATICS: free[3:].any()}
+
+
+def effects_in(residuals, observed, errors=None):
     """The effects that residuals show, the one that explains most first, each beside those before it.
 
     Parameters
     ----------
     residuals : Residuals
     observed : Observed
+    errors : CameraErrors, optional
+        Of the solution; what it has fitted is not named.
 
     Returns
     -------
     list of Found
     """
-    made = [(effect, effect.columns(observed)) for effect in EFFECTS]
+    fitted = fitted_already(errors)
+    made = [(effect, effect.columns(observed)) for effect in EFFECTS if not fitted.get(effect)]
     made = [(effect, columns) for effect, columns in made if columns is not None]
     found = []
     while len(found) < MOST_NAMED and made:
