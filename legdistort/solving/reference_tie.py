@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 from scipy.linalg import block_diag
 
-from ..exceptions import AssumptionWarning, InputError, some_of, warn
+from ..exceptions import AssumptionWarning, InputError, SolveError, some_of, warn
 from ..geometry import similarity
 from ..matching.cross_identification import identify
 from ..results.diagnostics import UsedReference
@@ -46,6 +46,8 @@ _LARGE = 2.0
 _ELSEWHERE = 25.0
 #: A map moves the solution to first order; what is left comes from another round.
 _MAP_ROUNDS = 2
+#: Factor on chi2 by which no map moves exposures whose detectors were fitted to the reference.
+_SPOILT = 3.0
 #: Modes of maps from which stars are held: of fewer, shear is one that exposures determine by themselves.
 FEWEST_MODES = 3
 
@@ -134,7 +136,8 @@ class ReferenceTie:
                 result = self._kept(self.solve(problem, state, hold=True), gauge)
             else:
                 problem = centred(problem, result.gauge, step)
-                result = self.solve(problem, state, common=common)
+                before, result = result.blocks.chi2, self.solve(problem, state, common=common)
+                self._check_step(problem, before, result)
         else:
             log.warning(
                 "the tie to %s is not settled after %d rounds: the last of them moved the plane by %.2g px rms, where "
@@ -158,6 +161,16 @@ class ReferenceTie:
         if result.converged:
             result = replace(result, status=f"{status}, tied to the reference in {count + 1} rounds{rest}")
         return problem, replace(result, gauge=replace(result.gauge, tie=made, unknown_maps=unknown)), prior, straight
+
+    def _check_step(self, problem, before, result):
+        """Raise `SolveError` where a step of the map has spoilt exposures of fewer stars than modes."""
+        if not self.joined or result.blocks.chi2 < _SPOILT * max(before, problem.xy.size):
+            return
+        n_stars = np.array([np.count_nonzero(problem.weight[0, problem.part(i)]) for i in range(problem.n_exposures)])
+        few = [problem.names[i] for i in np.flatnonzero(n_stars < problem.n_modes)]
+        if few:
+            words = f"{some_of(few, 4)} have too few stars for their distortions where {self.label} puts the plane"
+            raise SolveError(words, exposures=few)
 
     def _agreement(self, problem, result, equations, made):
         """The `Agreement` of the reference with everything else."""
