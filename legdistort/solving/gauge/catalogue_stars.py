@@ -38,7 +38,7 @@ class Joining:
     Static distortions of detectors are then those at the minimum of all that is known: found without the reference,
     about another plane, they would be off by what this moves them and distortions of exposures against one another,
     which is no map of the degree. And the stars tie detectors that no star ties. From one fit to the next it keeps
-    which stars of the reference deviate, and the factor on its errors.
+    which stars of the reference deviate, and the factor on its errors where these are sought.
 
     Parameters
     ----------
@@ -103,6 +103,8 @@ class Joining:
         used = ~np.isin(found.rows, self.deviant)
         factor = catalogue_map.factor_of(lengths, used, self.reference.finds_errors)
         deviant = found.rows[lengths(factor) > catalogue_map.CLIP]
+        if not self.reference.finds_errors:  # weights by a factor that a wrong camera called for would leave it wrong
+            factor = 1.0
         same = np.array_equal(deviant, self.deviant) and abs(np.log(factor / self.factor)) < _SAME_FACTOR
         if not same and 2 * len(deviant) < len(found.rows):
             self.deviant, self.factor = deviant, factor
