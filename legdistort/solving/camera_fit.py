@@ -212,13 +212,14 @@ class CameraFit:
     ----------
     sought : Sought
     join : callable, optional
-        ``join(fit)``, a fit with what else is known of where detectors lie to each other.
+        ``join(fit, statics)``, a fit with what else is known of where its stars lie; ``statics`` whether those of the
+        detectors are sought.
     """
 
     def __init__(self, sought, join=None):
         self.sought, self.step, self._departure = sought, None, np.zeros(sought.free.shape)
         self._stated = np.zeros(len(sought.free), dtype=bool)
-        self.join = join or (lambda fit: fit)
+        self.join = join or (lambda fit, _: fit)
 
     def settle(self, matches, estimate, *, layout_alone=False):
         """Matches with the camera with which `estimate`, ``estimate(matches)``, gives a fit that calls for no other.
@@ -235,7 +236,7 @@ class CameraFit:
         part, last = 1.0, np.zeros(sought.free.shape)
         for number in range(_STEPS):
             with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):  # the fit that comes last warns
-                fit = self.join(estimate(matches))
+                fit = self.join(estimate(matches), bool(sought.free[:, :, 3:].any()))
             held = self.step.undetermined if number >= _CHOOSING else None
             self.step = camera_step(fit, sought, self._departure, self._stated, held)
             # exposures give way to a change that they can undo, and then it comes back: half of it does not

@@ -8,6 +8,7 @@ their full covariance. It comes in two steps that are the posterior together, so
 twice: the common maps g from the offsets of the reference, all else integrated out, p(g | data, reference); then the
 stars with these maps held, p(stars | g, data, reference), in which the reference stands in the normal equations of its
 stars. The covariance is that of the second step and, through the directions in which the stars follow g, that of g.
+Static distortions of detectors, which change with g beyond first order, are found with it before (`Joining`).
 """
 
 import logging
@@ -17,9 +18,8 @@ from functools import partial
 import numpy as np
 from scipy.linalg import block_diag
 
-from ..exceptions import AssumptionWarning, InputError, some_of, warn
+from ..exceptions import AssumptionWarning, InputError, SolveError, some_of, warn
 from ..geometry import similarity
-from ..geometry.similarity import robust_similarity
 from ..matching.cross_identification import identify
 from ..results.diagnostics import UsedReference
 from ..results.errors.absolute_errors import plain_directions, variances
@@ -31,6 +31,7 @@ from .equations.problem import State
 from .equations.star_terms import StarPrior, packed, unpacked
 from .gauge import bent_reference, catalogue_map, catalogue_motions, hierarchy
 from .gauge.catalogue_agreement import agreement
+from .gauge.catalogue_stars import Joining, offered
 from .gauge.moved_fields import centred, moved_by, poses_of, similarities
 
 log = logging.getLogger(__name__)
@@ -45,9 +46,8 @@ _LARGE = 2.0
 _ELSEWHERE = 25.0
 #: A map moves the solution to first order; what is left comes from another round.
 _MAP_ROUNDS = 2
-#: Stars of a reference off by so many times the median of those on the same detectors join nothing: of Rayleigh's
-#: distribution that is chance below 1e-19, and maps that the exposures leave open make the median larger.
-_MISMATCH = 8.0
+#: Factor on chi2 by which no map moves exposures whose detectors were fitted to the reference.
+_SPOILT = 3.0
 #: Modes of maps from which stars are held: of fewer, shear is one that exposures determine by themselves.
 FEWEST_MODES = 3
 
@@ -75,6 +75,8 @@ class ReferenceTie:
         Whether the errors of the reference are found, its own only those of stars relative to others.
     degree : int
         Of a map that belongs to the reference alone; 0 for none.
+    joined : bool
+        Whether the camera was fitted to the reference too (`Joining`).
     """
 
     identified: object
@@ -86,6 +88,7 @@ class ReferenceTie:
     common: dict
     finds_errors: bool = False
     degree: int = 0
+    joined: bool = False
 
     def tie(self, problem, result):
         """The `Result` with the plane where the reference puts it and the `Tie` in its gauge, and the `MapPrior` there.
@@ -133,7 +136,8 @@ class ReferenceTie:
                 result = self._kept(self.solve(problem, state, hold=True), gauge)
             else:
                 problem = centred(problem, result.gauge, step)
-                result = self.solve(problem, state, common=common)
+                before, result = result.blocks.chi2, self.solve(problem, state, common=common)
+                self._check_step(problem, before, result)
         else:
             log.warning(
                 "the tie to %s is not settled after %d rounds: the last of them moved the plane by %.2g px rms, where "
@@ -157,6 +161,16 @@ class ReferenceTie:
         if result.converged:
             result = replace(result, status=f"{status}, tied to the reference in {count + 1} rounds{rest}")
         return problem, replace(result, gauge=replace(result.gauge, tie=made, unknown_maps=unknown)), prior, straight
+
+    def _check_step(self, problem, before, result):
+        """Raise `SolveError` where a step of the map has spoilt exposures of fewer stars than modes."""
+        if not self.joined or result.blocks.chi2 < _SPOILT * max(before, problem.xy.size):
+            return
+        n_stars = np.array([np.count_nonzero(problem.weight[0, problem.part(i)]) for i in range(problem.n_exposures)])
+        few = [problem.names[i] for i in np.flatnonzero(n_stars < problem.n_modes)]
+        if few:
+            words = f"{some_of(few, 4)} have too few stars for their distortions where {self.label} puts the plane"
+            raise SolveError(words, exposures=few)
 
     def _agreement(self, problem, result, equations, made):
         """The `Agreement` of the reference with everything else."""
@@ -193,7 +207,7 @@ class ReferenceTie:
             Where stars move: at degree 0, and if most motions deviate.
         """
         gauge, status = result.gauge, result.status
-        values, covariance = self._offered(self.identified, problem.terms.n, gauge.tie.factor)
+        values, covariance = offered(self.identified, problem.terms.n, gauge.tie.factor)
         used, joint, map_covariance = gauge.tie.used, None, gauge.tie.covariance
         if problem.terms.n:
             problem, result, used, joint = self._drifts_tied(problem, result, prior, values, covariance)
@@ -201,7 +215,7 @@ class ReferenceTie:
         log.info("stars are held at what %s knows of %d of them", self.label, np.count_nonzero(used))
         rows = self.identified.rows
         offsets = self.identified.xy - result.state.positions.T[rows]
-        more, more_covariance = self._offered(self.others, problem.terms.n, gauge.tie.factor)
+        more, more_covariance = offered(self.others, problem.terms.n, gauge.tie.factor)
         catalogue = StarPrior.of(
             len(self.names),
             np.concatenate([rows[used], self.others.rows]),
@@ -256,17 +270,6 @@ class ReferenceTie:
             said = {"found": True} if self.finds_errors else {"ratio": made.ratio}
             made = replace(again, factor=factor, **said)
         return equations, step, made
-
-    @staticmethod
-    def _offered(found, k, factor):
-        """Positions and motions in a reference: values (n, 2 + k) and covariances, NaN for what it does not have."""
-        n = len(found.rows)
-        values, covariance = np.full((n, 2 + k), np.nan), np.full((n, 2 + k, 2 + k), np.nan)
-        known = found.xy if found.motion is None else np.hstack([found.xy, found.motion])
-        m = min(known.shape[1], 2 + k)
-        values[:, :m], covariance[:, :m, :m] = known[:, :m], found.covariance[:, :m, :m]
-        values[~np.isfinite(np.einsum("jaa->ja", covariance))] = np.nan
-        return values, factor**2 * covariance
 
     @staticmethod
     def _kept(result, gauge):
@@ -376,7 +379,8 @@ class ReferenceTie:
         )
         relative = errors.star_matrix if len(positions) <= catalogue_map.DENSE else errors.stars
         bends = bent_reference.bends(result.gauge, positions[self.identified.rows], self.degree)
-        return catalogue_map.MapEquations(offsets, directions, relative, prior, bends)
+        fitted = self.common["camera"].stars[self.identified.rows, :2] if self.joined else None
+        return catalogue_map.MapEquations(offsets, directions, relative, prior, bends, fitted)
 
     def _move(self, directions, step, made):
         """By how much a step of the map moves the plane, and the error of the plane: rms over the stars, pixels."""
@@ -473,6 +477,7 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
         common={"shared_errors": fit.shared_errors, "camera": fit.camera_errors},
         finds_errors=reference.finds_errors,
         degree=reference.degree or 0,
+        joined=_has_statics(fit),
     )
     problem = fit.problem.scaled(fit.used.astype(float))
     problem, result, prior, tying = tying.tie(problem, result)
@@ -483,6 +488,12 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
     else:  # the map moves the plane alone
         result = replace(result, gauge=replace(result.gauge, tie=replace(result.gauge.tie, freedom=0.0)))
     return replace(fit, matches=replace(matches, sky=identified.sky, epoch=epoch), result=result)
+
+
+def _has_statics(fit):
+    """Whether a fit has static distortions of the detectors of a camera, which `Joining` ties."""
+    errors = fit.camera_errors
+    return fit.matches.camera.has_focal_plane and errors is not None and bool(errors.free[:, :, 3:].any())
 
 
 def _identified(fit, reference, pixel_scale):
@@ -496,39 +507,14 @@ def _identified(fit, reference, pixel_scale):
 
 
 def ties_to(reference, **tying):
-    """What ties a `Fit` to a reference, ``join(fit)`` and ``tie(fit)``; None and None without one.
+    """What ties a `Fit` to a reference, ``join(fit, statics)`` and ``tie(fit)``; None and None without one.
 
-    `join` makes of the fit of a camera one in which the stars of the reference tie detectors that no star ties: with
-    these stars as a prior, by which J determines the plane too. Where stars move the fit stays as it is. `tie` is
-    `tie_to`.
+    `join` is a `Joining`, `tie` is `tie_to`.
     """
     if reference is None:
         return None, None
-    return partial(_joined, reference=reference, **tying), partial(tie_to, reference=reference, **tying)
-
-
-def _joined(fit, *, reference, epoch, pixel_scale):
-    group = np.full(fit.problem.n_stars, -1)
-    group[fit.problem.star[fit.used]] = fit.matches.camera.group_of(fit.matches.table[fit.problem.order][fit.used])
-    if group.max() < 1 or fit.problem.terms.n or reference.degree:
-        return fit
-    found = _identified(fit, reference.at(fit.matches.epoch if epoch is None else epoch), pixel_scale)
-    positions, agrees = fit.result.state.positions.T, np.ones(len(found.rows), dtype=bool)
-    for g in range(group.max() + 1):  # which are off by as much as this group of detectors
-        mine = np.flatnonzero(group[found.rows] == g)
-        if len(mine) > FEWEST_MODES:
-            source, target = positions[found.rows[mine]], found.xy[mine]
-            off = np.hypot(*(similarity.apply(robust_similarity(source, target), source) - target).T)
-            agrees[mine] = off < _MISMATCH * np.median(off)
-    found = found.subset(agrees)
-    rough = similarities(fit.problem, found.rows, positions[found.rows], found.xy, reference.label)
-    catalogue = StarPrior.of(len(positions), found.rows, found.xy, found.covariance[:, :2, :2])
-    problem = replace(fit.problem, moving=replace(fit.problem.terms, catalogue=catalogue))
-    of, weighted = fit.options, problem.scaled(fit.used.astype(float))
-    how = {"loss": of.loss, "max_iterations": of.max_iterations}
-    return replace(
-        fit, problem=problem, result=minimisers.solve_joint(weighted, moved_by(problem, fit.result.state, rough), **how)
-    )
+    how = {"find": _identified, "solve": minimisers.solve_joint}
+    return Joining(reference, **how, **tying), partial(tie_to, reference=reference, **tying)
 
 
 def _held_back(fit, problem):

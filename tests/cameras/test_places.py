@@ -92,9 +92,7 @@ def test_a_bend_that_the_reference_tells_is_in_the_places(one):
     night, solution = one
     camera = solution.camera
     there = squared_pulls(night, 3, camera.places)
-    by_layout = squared_pulls(night, 3, {key: each.place for key, each in camera.detectors.items()})
     assert max(there) < 2
-    assert min(by_layout) > 5  # the errors of these hold after a map of degree 3
     words = " ".join(str(solution).split())
     assert "after one affine map of all together" in words
     assert "a bend of all together, as the reference tells it, is in places and errors" in words

@@ -79,6 +79,17 @@ def straightened(identified, equations, made, result, degree):
     return replace(identified, xy=identified.xy - off, **known), replace(made, own=own)
 
 
+def without_own_map(identified, result, degree):
+    """The stars of a reference less the map up to a degree by which they lie off those of a result."""
+    xy = result.state.positions.T[identified.rows]
+    maps, off = bends(result.gauge, xy, degree).reshape(2 * len(xy), -1), (identified.xy - xy).ravel()
+    modes = _modes(result.gauge, degree)
+    similar = plain_directions(result.gauge, xy, modes.size) @ modes.similar.T
+    both = np.hstack([maps, similar.reshape(len(off), -1)])
+    own = maps @ np.linalg.lstsq(both, off)[0][: maps.shape[1]]
+    return replace(identified, xy=identified.xy - own.reshape(xy.shape))
+
+
 def is_as_stated(made, agrees):
     """Whether a reference is what it states: its errors, nearly all of its stars, and its shape."""
     return made.factor == 1 and not agrees.is_bent and np.mean(~made.used) <= GROSS_ERRORS

@@ -45,7 +45,7 @@ def agreement(equations, stated, used, motions=None):
     rate, rate_error = (np.nan, np.nan) if motions is None else _in_common(motions[used])
     return Agreement(
         chi2=float(chi2),
-        dof=float(2 * np.count_nonzero(used) - n_maps - equations.bends.shape[2]),
+        dof=float(2 * np.count_nonzero(used) - n_maps - equations.bends.shape[2] - stated.of_fitted(used)),
         bend_chi2=float(max(total - alone.chi2(alone.left(value, used), used), 0)),
         bend_dof=float(dof),
         bend=float(np.sqrt(np.sum(moved**2))) if n_maps == len(covariance) else np.nan,

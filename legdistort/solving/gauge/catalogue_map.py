@@ -116,11 +116,14 @@ class MapEquations:
     prior : MapPrior
     bends : ndarray, shape (n, 2, q), optional
         F, maps of which the reference may have any, at its stars.
+    fitted : ndarray, shape (n, 2, r), optional
+        P, the part P P' of that covariance, at the stars of the reference, of what was fitted to these offsets too.
     """
 
-    def __init__(self, offsets, directions, relative, prior, bends=None):
+    def __init__(self, offsets, directions, relative, prior, bends=None, fitted=None):
         self.offsets, self.directions, self.relative, self.prior = offsets, directions, relative, prior
         self.bends = np.zeros((len(offsets.rows), 2, 0)) if bends is None else bends
+        self.fitted = np.zeros((len(offsets.rows), 2, 0)) if fitted is None else fitted
         self._factors = {}
         rows, n = offsets.rows, len(directions)
         self.dense = len(relative) == 2 * n
@@ -132,13 +135,14 @@ class MapEquations:
     def times(self, factor):
         """The same with other errors of the reference, by a factor."""
         offsets = replace(self.offsets, covariance=factor**2 * self.offsets.covariance)
-        return MapEquations(offsets, self.directions, self.relative, self.prior, self.bends)
+        return MapEquations(offsets, self.directions, self.relative, self.prior, self.bends, self.fitted)
 
     def of_some(self, which):
         """The same for some of the offsets."""
         names = ("rows", "values", "covariance")
         offsets = replace(self.offsets, **{name: getattr(self.offsets, name)[which] for name in names})
-        return MapEquations(offsets, self.directions, self.relative, self.prior, self.bends[which])
+        more = self.bends[which], self.fitted[which]
+        return MapEquations(offsets, self.directions, self.relative, self.prior, *more)
 
     def without_prior(self):
         """The same with nothing known of the map beforehand."""
@@ -259,7 +263,16 @@ class MapEquations:
 
         `share` (2 k, 2 k): what of the common map the offsets determine, its covariance times their information.
         """
-        return 2 * np.count_nonzero(used) - self.bends.shape[2] - np.trace(share)
+        return 2 * np.count_nonzero(used) - self.bends.shape[2] - np.trace(share) - self.of_fitted(used)
+
+    def of_fitted(self, used):
+        """Degrees of freedom of the used offsets that went into what was fitted to them too.
+
+        Its errors P are in their covariance C, and make these offsets less by what they make others more:
+        ``tr C^-1 (C - 2 P P')`` are left.
+        """
+        fitted = self.fitted[used].reshape(2 * np.count_nonzero(used), self.fitted.shape[2])
+        return 2 * np.sum(fitted * self._weighted(used, fitted)) if fitted.size else 0.0
 
     def agreement(self, used):
         """chi2 of the used offsets less the map, and its degrees of freedom."""
@@ -372,6 +385,13 @@ def _as_far_from_prior(equations, factor):
     share = np.einsum("naa->", out.precision) / np.einsum("naa->", equations.precision)
     out.prior = replace(out.prior, information=share * out.prior.information)
     return out
+
+
+def factor_of(lengths, which, found):
+    """That factor: where chance explains the lengths, or errors are sought, as `accepted` takes it."""
+    if not found and np.median(lengths(1.0)[which]) < _USUAL * _SQRT:
+        return 1.0
+    return _factor_of(lengths, which, _TINY if found else 1.0)
 
 
 def _factor_of(lengths, which, least):
