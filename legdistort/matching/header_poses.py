@@ -24,9 +24,9 @@ _SCALE_OFF, _MANY = 3e-3, 6.0
 #: The dithers by headers and by stars are compared in so many exposures or more; they contradict each other if a turn
 #: and a scale explain what they differ by, by no more than this chance, and that is more than this part of the dithers.
 _FEWEST, _BY_CHANCE, _DEPARTURE = 4, 1e-4, 0.05
-#: Of so many headers or more, one is apart that lies off the others by this [pix] or more, by more than this part of its
-#: dither (as scales and distortions displace it), and by so much more than these scatter that chance explains it in no
-#: more than this part of all sets; and one at most of so many.
+#: Of so many headers or more, one is apart that lies off the others by this [pix] or more, by more than this part of
+#: its dither (as scales and distortions displace it), and by so much more than these scatter that chance explains it in
+#: no more than this part of all sets; and one at most of so many.
 _SOME, _LEAST, _STRETCH, _BY_SCATTER, _ONE_OF = 4, 2.0, 8e-3, 4e-3, 4
 #: Variance [pix^2] below which a pose counts as exact.
 _EXACT = 1e-12
