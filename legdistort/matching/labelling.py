@@ -48,6 +48,8 @@ _FEWEST_GAINED = 10
 #: A detector is lost of which less than this part of what the others have is tied to other exposures, and by chance
 #: alone less than that; from so many detections on.
 _FEW, _CHANCE, _ENOUGH = 0.7, 0.1, 20
+#: Names in a sentence.
+_MOST_NAMED = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +106,9 @@ def labelled(table, exposures, shape, camera, options):
         begun = detector_layout.stated_layout(parts)
     else:
         if camera is None and parts:
-            camera = detector_layout.with_usual_scales(Camera.of_frames(parts))
+            camera = Camera.of_frames(parts)
+            _check_instruments(parts, camera)
+            camera = detector_layout.with_usual_scales(camera)
             log.info("layout of the detectors by the headers, from which solve begins to find it: %s", camera)
         elif parts:
             camera = camera.with_headers(parts)
@@ -132,6 +136,20 @@ def labelled(table, exposures, shape, camera, options):
         AssumptionWarning,
     )
     return set_right
+
+
+def _check_instruments(parts, camera):
+    """Raise `InputError`, naming them, for exposures of another instrument that has detectors of its own."""
+    named = {each.name: str(each.header.get("INSTRUME", "")).strip() for each in parts}
+    ours = {named[each.name] for each in parts if each.detector in camera.detectors}
+    others = [each.name for each in parts if each.detector not in camera.detectors and named[each.name] not in ours]
+    if ours and others and all(map(named.get, others)):
+        theirs = " and ".join(dict.fromkeys(map(named.get, others)))
+        raise InputError(
+            f"{some_of(others, _MOST_NAMED)} {'are' if len(others) > 1 else 'is'} of {theirs}, another instrument than "
+            f"{' and '.join(sorted(ours))} ({', '.join(camera.detectors)}): leave out what is of {theirs}, and match "
+            "and solve it alone"
+        )
 
 
 def _set_right(table, exposures, shape, begun, options):
