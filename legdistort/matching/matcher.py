@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+#: Exposures up to which it is told what fewer of them for a star would keep: `min_exposures` are most of them then.
+_FEW_EXPOSURES = 5
+
 
 @plain_numbers
 def match(
@@ -271,10 +274,20 @@ def _keep_common(table, star, min_exposures, left_out, tying=None, *, tell=False
         )
         if not poor:
             if tell and not keep.all():
-                log.info("%d of %d detections are of stars in fewer than %d exposures (min_exposures), and left out",
-                         np.count_nonzero(~keep), len(keep), min_exposures)  # fmt: skip
+                others = count[inverse][~keep & (star >= 0)] if len(seen[0]) <= _FEW_EXPOSURES else ()
+                log.info(
+                    "%d of %d detections are of stars in fewer than %d exposures (min_exposures), and left out%s",
+                    np.count_nonzero(~keep), len(keep), min_exposures, _kept_in_words(others, min_exposures),
+                )  # fmt: skip
             return table[keep], star[keep]
         star = np.where(np.isin(exposure, list(poor)), -1, star)
+
+
+def _kept_in_words(count, min_exposures):
+    """How many of detections of stars in so many exposures (n,) a smaller number asked for keeps; empty for none."""
+    kept = {least: np.count_nonzero(np.asarray(count) >= least) for least in range(2, min_exposures)}
+    told = [f"--min-exposures {least} keeps {n}" for least, n in kept.items() if n][:2]
+    return f": {', '.join(told)} of them" * bool(told)
 
 
 def _finish(table, star, shapes, headers, left_out, epoch, distortions):
