@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 #: Chance below which two maps differ.
 ALARM = 0.003
 _EXACT = 1e-6  # error of what is stated without one, beside what has one [pix]
+_SHOWN = 5e-5  # difference of coefficients [pix] from which on they are printed; those of 1 sigma and more always are
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -207,11 +208,17 @@ class MapDifference(ShownAsPrinted):
         lines.append(
             "Difference: coefficients of the second map less those of the first, undistorted to detector pixels."
         )
-        lines.append(f"{'detector':10s} {'axis':4s} {'mode':14s} {'difference [px]':>15s} {'error':>9s} {'sigma':>6s}")
-        for row in self.modes:
+        table = self.modes
+        shown = (np.abs(table["difference"].value) > _SHOWN) | (np.abs(table["significance"]) > 1)
+        head = f"{'detector':10s} {'axis':4s} {'mode':14s} {'difference [px]':>15s} {'error':>9s} {'sigma':>6s}"
+        lines += [head] * bool(shown.any())
+        for row in table[shown]:
             mode, error = f"L{row['x_degree']}(x) L{row['y_degree']}(y)", row["error"].value
-            shown = f"{error:9.2g} {row['significance']:6.1f}" if np.isfinite(error) else f"{'-':>9s} {'-':>6s}"
-            lines.append(f"{row['detector']:10s} {row['axis']:4s} {mode:14s} {row['difference'].value:15.4f} {shown}")
+            known = f"{error:9.2g} {row['significance']:6.1f}" if np.isfinite(error) else f"{'-':>9s} {'-':>6s}"
+            lines.append(f"{row['detector']:10s} {row['axis']:4s} {mode:14s} {row['difference'].value:15.4f} {known}")
+        if n_alike := np.count_nonzero(~shown):
+            of = "others" if shown.any() else "modes"
+            lines.append(f"{n_alike} {of} differ by no more than {_SHOWN:.5f} px, and by no more than 1 sigma")
         return "\n".join([*lines, "", *self.stars.lines()] if self.stars else lines)
 
 

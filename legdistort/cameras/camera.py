@@ -339,7 +339,7 @@ class Camera(ShownAsPrinted):
             raise InputError(
                 f"camera {self.name} has no detector {unknown[0]!r}; it has {', '.join(self.detectors)}, and the "
                 f"column detector has {', '.join(keys)}, not the same numbers each once: rename these in the column, "
-                "or give the camera of these detectors"
+                "leave out what is of another instrument, or give the camera of these detectors"
             )
         return detector
 

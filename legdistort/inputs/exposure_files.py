@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.io import fits
+from astropy.wcs import WCS
 
 from ..exceptions import (
     AssumptionWarning,
@@ -316,6 +317,7 @@ def _read_each(paths, read, ext, maps, progress, bad=None, copies=None):
             exposures.append(exposure)
     exposures = told_apart(exposures)
     _warn_of_doubts(exposures)
+    _tell_without_gwcs(exposures)
     _tell_weight_maps(sources, maps)
     return with_detectors(exposures)
 
@@ -362,6 +364,21 @@ def _warn_of_doubts(exposures):
     if named:
         sentences = "; ".join(f"{some_of(names, 3)}: {doubt}" for doubt, names in named.values())
         warn(f"{sentences} (legdistort show FRAME prints what a frame states)", AssumptionWarning)
+
+
+def _tell_without_gwcs(exposures):
+    """Say of which files the WCS of the header is taken where others of the telescope have a gwcs."""
+    by_telescope = {}
+    for each in exposures:
+        if each.wcs is not None:
+            kind = by_telescope.setdefault(each.header.get("TELESCOP"), {True: [], False: []})
+            kind[isinstance(each.wcs, WCS)].append(each.name)
+    for kind in by_telescope.values():
+        if all(kind.values()):
+            log.warning(
+                "%s: no gwcs, unlike the other %d: the WCS of the header is taken in its place",
+                some_of(kind[True], 3), len(kind[False]),
+            )  # fmt: skip
 
 
 def _one_after_another(sources, parts, maps):

@@ -67,7 +67,7 @@ def from_hdulist(hdulist, ext, label, path, good=None):
     )  # fmt: skip
     if lacking:
         stated = stated.with_doubt(f"the WCS of the header has no card {lacking} and is not used")
-    if not lacking and (words := two_matrices(header)):
+    if not lacking and origin is None and (words := two_matrices(header)):
         stated = stated.with_doubt(words)
     if is_left_out(primary, own):
         stated = stated.with_doubt(

@@ -24,6 +24,10 @@ _SCALE_OFF, _MANY = 3e-3, 6.0
 #: The dithers by headers and by stars are compared in so many exposures or more; they contradict each other if a turn
 #: and a scale explain what they differ by, by no more than this chance, and that is more than this part of the dithers.
 _FEWEST, _BY_CHANCE, _DEPARTURE = 4, 1e-4, 0.05
+#: Of so many headers or more, one is apart that lies off the others by this [pix] or more, by more than this part of
+#: its dither (as scales and distortions displace it), and by so much more than these scatter that chance explains it in
+#: no more than this part of all sets; and one at most of so many.
+_SOME, _LEAST, _STRETCH, _BY_SCATTER, _ONE_OF = 4, 2.0, 8e-3, 4e-3, 4
 #: Variance [pix^2] below which a pose counts as exact.
 _EXACT = 1e-12
 
@@ -183,6 +187,10 @@ class HeaderPoses:
         if np.count_nonzero(good) > 2:
             off = np.abs(logs - np.median(logs[good]))
             good &= off < max(_SCALE_OFF, _MANY * 1.4826 * np.median(off[good]))
+        centres = np.array([_grid(self.shapes[n], 1) for n in names])
+        seen = similarity.apply_inverses(np.array([found[n] for n in names]), centres)[:, 0]
+        moved = similarity.apply_each(steps, seen) - seen @ np.median(steps[:, :, :2], axis=0).T
+        good[np.flatnonzero(good)[_apart(moved[good], seen[good])]] = False
         return names, steps, corners, good
 
     def _compare_dithers(self, found, mean):
@@ -219,6 +227,42 @@ class HeaderPoses:
                 "the headers",
                 AssumptionWarning,
             )
+
+
+def _apart(moved, places):
+    """Which headers have their exposures apart from where the others have theirs, by how these scatter.
+
+    One at a time, the worst first, against those that are left: the generalised extreme Studentized deviate of Rosner
+    (1983), here of displacements in two axes. Several that are alike are a visit or a night, with a pointing of its
+    own: none of them is a wrong header.
+
+    Parameters
+    ----------
+    moved : ndarray, shape (n, 2)
+        By how much each header has its exposure elsewhere than the stars [pix], but for a common shift.
+    places : ndarray, shape (n, 2)
+        Where the exposures lie [pix].
+
+    Returns
+    -------
+    list of int
+    """
+    left, tried, n_apart = list(range(len(moved))), [], 0
+    if len(moved) < _SOME:
+        return []
+    for _ in range(len(moved) // _ONE_OF):
+        n = len(left)
+        square = np.sum((moved[left] - moved[left].mean(axis=0)) ** 2, axis=1)
+        k = int(np.argmax(square))
+        others = max((square.sum() - square[k] * n / (n - 1)) / (2 * (n - 2)), _EXACT)  # their variance per axis
+        chance = n * special.fdtrc(2, 2 * (n - 2), square[k] * n / (n - 1) / 2 / others)
+        tried.append(left.pop(k))
+        off, dither = (np.linalg.norm(each[tried[-1]] - each[left].mean(axis=0)) for each in (moved, places))
+        if chance < _BY_SCATTER and off > max(_LEAST, _STRETCH * dither):
+            n_apart = len(tried)
+    apart = tried[:n_apart]
+    between = np.linalg.norm(moved[apart, None] - moved[apart], axis=-1)
+    return [] if np.any(between[np.triu_indices(n_apart, 1)] < _LEAST) else apart
 
 
 def _contradicting(exposures):

@@ -20,7 +20,6 @@ from ..inputs.exposures import stated_numbers
 from ..measurement.flags import Flag, flags_of
 from ..runtime import parallel
 from .detectors import detector_layout, detector_places
-from .detectors.foreign_images import foreign_images
 from .exposure_groups import interlink, link, standing, unite, without
 from .fields import apart
 from .header_poses import HeaderPoses
@@ -48,6 +47,8 @@ _FEWEST_GAINED = 10
 #: A detector is lost of which less than this part of what the others have is tied to other exposures, and by chance
 #: alone less than that; from so many detections on.
 _FEW, _CHANCE, _ENOUGH = 0.7, 0.1, 20
+#: Names in a sentence.
+_MOST_NAMED = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +105,9 @@ def labelled(table, exposures, shape, camera, options):
         begun = detector_layout.stated_layout(parts)
     else:
         if camera is None and parts:
-            camera = detector_layout.with_usual_scales(Camera.of_frames(parts))
+            camera = Camera.of_frames(parts)
+            _check_instruments(parts, camera)
+            camera = detector_layout.with_usual_scales(camera)
             log.info("layout of the detectors by the headers, from which solve begins to find it: %s", camera)
         elif parts:
             camera = camera.with_headers(parts)
@@ -112,7 +115,7 @@ def labelled(table, exposures, shape, camera, options):
             table = with_ids_of(table, camera.detectors)
         found = _labelled_in(table, exposures, shape, camera, options)
         if not found.lost(_FEW, options.min_exposures):
-            return _without_lost(found, options.min_exposures)
+            return found
         begun, n_tied = (camera.name, camera.detectors), found.n_tied(options.min_exposures)
     set_right, words = _set_right(table, exposures, shape, begun, options)
     if over and set_right is None:
@@ -132,6 +135,20 @@ def labelled(table, exposures, shape, camera, options):
         AssumptionWarning,
     )
     return set_right
+
+
+def _check_instruments(parts, camera):
+    """Raise `InputError`, naming them, for exposures of another instrument that has detectors of its own."""
+    named = {each.name: str(each.header.get("INSTRUME", "")).strip() for each in parts}
+    ours = {named[each.name] for each in parts if each.detector in camera.detectors}
+    others = [each.name for each in parts if each.detector not in camera.detectors and named[each.name] not in ours]
+    if ours and others and all(map(named.get, others)):
+        theirs = " and ".join(dict.fromkeys(map(named.get, others)))
+        raise InputError(
+            f"{some_of(others, _MOST_NAMED)} {'are' if len(others) > 1 else 'is'} of {theirs}, another instrument than "
+            f"{' and '.join(sorted(ours))} ({', '.join(camera.detectors)}): leave out what is of {theirs}, and match "
+            "and solve it alone"
+        )
 
 
 def _set_right(table, exposures, shape, begun, options):
@@ -161,27 +178,13 @@ def _set_right(table, exposures, shape, begun, options):
 
 
 def _without_lost(found, least):
-    """The detections without those of detectors, or images, of which so few are tied as chance ties, with a warning."""
-    lost = found.lost(_CHANCE, least)
-    if lost:
+    """The detections without those of detectors of which so few are tied as chance ties, with a warning."""
+    if lost := found.lost(_CHANCE, least):
         ids = found.camera.ids(found.table)
         found.star[np.isin(ids, lost)] = -1
         warn(
             f"hardly a detection of detector{'s' * (len(lost) > 1)} {', '.join(lost)} fits those of the others, and "
             f"the dithers do not tell why: nothing of it is used; {detector_layout.CURE}",
-            AssumptionWarning,
-        )
-    if found.camera is None or not found.camera.has_focal_plane or len(found.names) < 2:
-        return found
-    foreign = foreign_images(found.camera, found.table, found.star, found.is_tied(least))
-    foreign = {image: counts for image, counts in foreign.items() if image[1] not in lost}
-    if foreign:
-        images = zip(found.table["exposure"], found.camera.ids(found.table), strict=True)
-        found.star[[image in foreign for image in images]] = -1
-        told = [f"{key} of {name} ({n} of {seen})" for (name, key), (n, seen) in foreign.items()]
-        warn(
-            f"hardly a detection where other exposures looked is a star of theirs, of detector {', '.join(told)}: "
-            "nothing of it is used; is it the list of another field, exposure or detector?",
             AssumptionWarning,
         )
     return found

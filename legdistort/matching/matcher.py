@@ -29,6 +29,7 @@ from ..measurement.flags import UNUSABLE
 from ..priors.from_headers import describe, header_distortions
 from ..runtime.guards.units import plain_numbers
 from .detectors import detector_layout
+from .detectors.foreign_images import without_foreign_images
 from .labelling import add_numbers, labelled
 from .matches import Matches
 from .options import MatchOptions
@@ -43,6 +44,8 @@ log = logging.getLogger(__name__)
 
 #: Years between exposures in which stars may move by more than the tolerance that is found.
 LONG = 1.0
+#: Exposures up to which it is told what fewer of them for a star would keep: `min_exposures` are most of them then.
+_FEW_EXPOSURES = 5
 
 
 @plain_numbers
@@ -166,6 +169,7 @@ def match(
         if mended is not None:
             again = vars(replace(options, columns=None)) | {"camera": Camera.of_frames(mended)}
             return match(detections, exposures=mended, shape=shape, **again)
+        star = without_foreign_images(camera, table, star, min_exposures)
     tying = _ties_of_few(camera, table, star, min_exposures) if camera is not None and several else None
     table, star = _keep_common(table, star, min_exposures if several else 1, left_out, tying, tell=True)
     epoch = mean_epoch(e.header for e in named.values()) if named else None
@@ -290,10 +294,20 @@ def _keep_common(table, star, min_exposures, left_out, tying=None, *, tell=False
         )
         if not poor:
             if tell and not keep.all():
-                log.info("%d of %d detections are of stars in fewer than %d exposures (min_exposures), and left out",
-                         np.count_nonzero(~keep), len(keep), min_exposures)  # fmt: skip
+                others = count[inverse][~keep & (star >= 0)] if len(seen[0]) <= _FEW_EXPOSURES else ()
+                log.info(
+                    "%d of %d detections are of stars in fewer than %d exposures (min_exposures), and left out%s",
+                    np.count_nonzero(~keep), len(keep), min_exposures, _kept_in_words(others, min_exposures),
+                )  # fmt: skip
             return table[keep], star[keep]
         star = np.where(np.isin(exposure, list(poor)), -1, star)
+
+
+def _kept_in_words(count, min_exposures):
+    """How many of detections of stars in so many exposures (n,) a smaller number asked for keeps; empty for none."""
+    kept = {least: np.count_nonzero(np.asarray(count) >= least) for least in range(2, min_exposures)}
+    told = [f"--min-exposures {least} keeps {n}" for least, n in kept.items() if n][:2]
+    return f": {', '.join(told)} of them" * bool(told)
 
 
 def _finish(table, star, shapes, headers, left_out, epoch, distortions):

@@ -74,6 +74,24 @@ def test_arrows_of_nothing_do_not_look_like_something():
     pyplot.close(ax.figure)
 
 
+def test_modes_that_do_not_differ_are_counted_and_not_listed():
+    prior = old(1, static_sigma=0.01)
+    mean = prior.mean.copy()
+    mean[0, 4] += 0.02
+    mean[1, 6] += 3e-5
+    lines = str(ld.difference(prior, ld.Prior(mean, static_sigma=0.01, shape=SHAPE))).splitlines()
+    listed = [line.split()[1:5] for line in lines if line.startswith("1 ")]
+    assert ["x", "L1(x)", "L1(y)", "0.0201"] in listed
+    assert all(abs(float(each[3])) >= 1e-4 for each in listed)
+    n = 18 - len(listed)  # of 10 modes an axis, without shifts
+    assert 10 < n < 18
+    assert lines[-1] == f"{n} others differ by no more than 0.00005 px, and by no more than 1 sigma"
+    assert str(ld.difference(prior, prior)).splitlines()[-2:] == [
+        "Difference: coefficients of the second map less those of the first, undistorted to detector pixels.",
+        "18 modes differ by no more than 0.00005 px, and by no more than 1 sigma",
+    ]
+
+
 def test_the_sign_and_the_length_of_arrows_are_stated():
     """Second minus first; one arrow has a round length that is written beside it, in the scale of the others."""
     prior = old(1)

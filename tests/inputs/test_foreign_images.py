@@ -1,5 +1,6 @@
 """Images with what belongs to them in the forms of others: NDData, JWST, Roman, flags of pixels, any shared WCS."""
 
+import io
 import pickle
 import warnings
 
@@ -237,6 +238,33 @@ def test_jwst_rate_has_no_gwcs(data, tmp_path):
         hdus["ASDF"].data["ASDF_METADATA"][0, :5] = 0
         hdus.writeto(tmp_path / "bad_rate.fits")
     assert isinstance(ld.read_exposures(tmp_path / "bad_rate.fits")[0].wcs, WCS)
+
+
+def test_a_file_without_the_gwcs_of_the_others_is_named(data, tmp_path, caplog, recwarn):
+    """Its header serves, and is said to; what its header says twice is said of no file whose gwcs is used."""
+    cards = linear_wcs().to_header()
+    twice = {f"CD{i}_{j}": 2 * cards[f"CDELT{i}"] * (i == j) for i in (1, 2) for j in (1, 2)} | {"PC1_1": 1.0}
+    tree = io.BytesIO()
+    asdf.AsdfFile({"meta": {"wcs": bent_wcs()}}).write_to(tree)
+    content = np.frombuffer(tree.getvalue(), np.uint8)
+    column = fits.Column("ASDF_METADATA", f"{len(content)}B", array=content[None])
+    for k in range(3):
+        header = fits.Header(cards)
+        header.update(twice if k < 2 else {})
+        hdus = [
+            fits.PrimaryHDU(header=fits.Header([("TELESCOP", "JWST")])),
+            fits.ImageHDU(data + k, header, name="SCI"),
+        ]
+        hdus += [fits.BinTableHDU.from_columns([column], name="ASDF")] * (k < 2)
+        fits.HDUList(hdus).writeto(tmp_path / f"jw{k}_cal.fits")
+    found = ld.open_exposures([tmp_path / f"jw{k}_cal.fits" for k in range(3)])
+    assert [isinstance(each.wcs, WCS) for each in found] == [False, False, True]
+    words = "jw2_cal: no gwcs, unlike the other 2: the WCS of the header is taken in its place"
+    assert caplog.messages.count(words) == 1
+    assert not [each for each in recwarn if "two matrices" in str(each.message)]
+    caplog.clear()
+    ld.open_exposures(tmp_path / "jw2_cal.fits")
+    assert "no gwcs" not in caplog.text
 
 
 # --- Roman -------------------------------------------------------------------------------------------------------

@@ -283,6 +283,17 @@ def test_a_catalogue_of_the_jwst_pipeline(tmp_path, total, isophotal, recwarn):
     assert not recwarn.list
 
 
+@pytest.mark.parametrize("name", ["aper_total_abmag", "isophotal_vegamag"])
+def test_a_catalogue_of_the_jwst_pipeline_without_fluxes_has_its_magnitudes(tmp_path, name):
+    listed = Table({"label": [1, 2, 3], "xcentroid": [10.0, 20.0, 30.0], "ycentroid": [5.0, 6.0, 7.0]})
+    listed[name] = [17.0, 19.5, np.nan]
+    listed.write(tmp_path / "a_cat.ecsv")
+    out = column_contract.check(read_table(tmp_path / "a_cat.ecsv", error=0.02), column_contract.DETECTED, "t")
+    assert_allclose(out["mag"], [17.0, 19.5, np.nan])
+    assert_allclose(out["flux"][:2], 10 ** (-0.4 * np.array([17.0, 19.5])))
+    assert np.isnan(out["flux"][2])
+
+
 def test_names_of_columns_between_other_comments(tmp_path):
     """As the xym2bar of J. Anderson writes them: names, numbers of the columns, dots (MATCHUP.XYMEEE)."""
     text = (

@@ -5,9 +5,10 @@ from dataclasses import replace
 import header_layouts
 import numpy as np
 import pytest
+from astropy.table import vstack
 
 import legdistort
-from legdistort.exceptions import AssumptionWarning
+from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.matching.detectors import detector_places
 from legdistort.measurement.flags import Flag
 
@@ -113,3 +114,19 @@ def test_detectors_with_distortions_of_their_own_share_their_stars(solved):
         assert len(solution.stars) == len(np.unique(true))
         left = np.hypot(*(solution.residuals[name].value for name in ("dx", "dy")))
         assert np.median(left) < 0.02
+
+
+def test_what_is_of_another_instrument_is_named_and_to_be_left_out():
+    night = header_layouts.Night(3, n=3, n_stars=60)
+    for each in night.exposures:
+        each.header["INSTRUME"] = "NIRCAM"
+    part = night.exposures[0]
+    other = replace(part, name="b_mirimage", exposure="b", detector="MIRIMAGE", header={"INSTRUME": "MIRI"})
+    rows = night.table[(night.table["exposure"] == part.exposure) & (night.table["detector"] == part.detector)]
+    rows.replace_column("exposure", ["b"] * len(rows))
+    rows.replace_column("detector", ["MIRIMAGE"] * len(rows))
+    words = (
+        r"^b_mirimage is of MIRI, another instrument than NIRCAM \(1, 2, 3, 4\): leave out what is of MIRI, and match"
+    )
+    with pytest.raises(InputError, match=words):
+        legdistort.match(vstack([night.table, rows]), exposures=[*night.exposures, other], min_exposures=2)

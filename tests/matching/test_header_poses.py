@@ -58,6 +58,47 @@ def test_one_header_that_is_off_is_named():
         assert place(stated)[1] is SKY
 
 
+def of_a_visit(rng, scatter, n=4, dithers=500.0):
+    """Header WCSs of dithers by half a field, whose pointings scatter, and poses by their stars."""
+    found = rng.uniform(-dithers, dithers, (n, 2))
+    return found + rng.normal(0, scatter, (n, 2)), found
+
+
+def test_one_of_four_dithers_whose_header_is_16_pixels_off_is_named_and_has_no_part_in_the_sky():
+    rng, named = np.random.default_rng(2), 0
+    for _ in range(40):
+        stated, found = of_a_visit(rng, 0.7)
+        stated[2] += [-4.0, 15.5]
+        made = told(list(map(pose, stated)), found)
+        named += made.off.keys() == {"e2"}
+    assert named > 30
+    stated, found = of_a_visit(rng, 0.5)
+    stated[2] += [-4.0, 15.5]
+    with warns_here(AssumptionWarning, match=r"header WCS of e2 contradicts the stars by up to 16 px; the sky is"):
+        poses, _ = place(stated, found)
+    off = [poses[f"e{k}"][:, 2] - stated[k] for k in (0, 1, 3)]
+    assert_allclose(np.mean(off, axis=0), 0, atol=1e-9)
+
+
+def test_headers_of_usual_scatter_are_seldom_accused():
+    """Less than one set in a hundred, and none by a visit among others, or by dithers that a scale displaces."""
+    rng, accused = np.random.default_rng(4), {4: 0, 11: 0}
+    for n in accused:
+        names = [f"e{k}" for k in range(n)]
+        for _ in range(400):
+            stated, found = of_a_visit(rng, 5.0, n)
+            headers = HeaderPoses(
+                dict(zip(names, map(pose, stated), strict=True)), dict.fromkeys(names, (2000, 2000)), SKY
+            )
+            accused[n] += bool(headers.pointing(dict(zip(names, map(pose, found), strict=True))).off)
+    assert all(0 < number <= 5 for number in accused.values())
+    visit, found = of_a_visit(rng, 0.1, 12)
+    visit[-3:] += [9.0, 0.0]
+    assert told(list(map(pose, visit)), found).off == {}
+    mosaic = np.array([[0, 0], [3, 5], [-4, 2], [900, 200]])
+    assert told(list(map(pose, 1.004 * mosaic)), mosaic).off == {}
+
+
 def shifted(*, sign=1.0, stated=True):
     """Positions in two frames whose headers have no WCS but may state a shift; most are in one of them alone."""
     rng, shift = np.random.default_rng(5), np.array([150.0, -140.0])

@@ -110,6 +110,22 @@ def test_angles_at_which_a_plain_vote_holds_in_a_corner_only(n, angle, seed):
     assert_good(table, match(table, shape=SHAPE))
 
 
+@pytest.mark.parametrize("n", [4, 6])
+def test_what_is_left_out_of_few_dithers_says_what_would_keep_it(n, caplog):
+    """40 stars are in all exposures, 12 in three of them, 8 in two, 5 in one."""
+    caplog.set_level("INFO")
+    rng, rows = np.random.default_rng(1), []
+    stars = rng.uniform(100, 1900, (65, 2))
+    for k in range(n):
+        seen = stars[: (65, 60, 52, 40)[min(k, 3)]] + rng.uniform(-80, 80, 2)
+        rows += [(f"e{k}", x, y, 0.02, 0.02) for x, y in seen + rng.normal(0, 0.02, seen.shape)]
+    table = Table(rows=rows, names=["exposure", "x", "y", "x_err", "y_err"])
+    match(table, shape=(2000, 2000))
+    words = f"57 of {40 * n + 57} detections are of stars in fewer than 4 exposures (min_exposures), and left out"
+    told = ": --min-exposures 2 keeps 52, --min-exposures 3 keeps 36 of them" if n == 4 else ""
+    assert words + told in caplog.messages
+
+
 def test_few_stars_half_of_them_missing_or_false():
     table = make_field(20, *six_poses(0.5, 100), seed=3, common=0.8, spurious=0.5)
     assert_good(table, match(table, shape=SHAPE), recall=0.9, purity=0.97)

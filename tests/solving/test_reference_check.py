@@ -69,6 +69,20 @@ def test_absolute_positions_do_not_pass_on_a_reference_that_fails():
     assert "contradict" not in solved(0).gauge.sentence
 
 
+def test_a_degree_that_is_too_low_is_named_before_a_reference_that_is_right():
+    """And its cure, first, cures: the exposures are of degree 3."""
+    data, truth = dense_model.drawn_set(0, rolls=30.0, dynamic=0.05, static=0.0)
+    table = made_catalogues.catalogue(truth["stars"], 0)
+    with pytest.warns(LegdistortWarning):
+        check = check_of(ld.solve(drawn_sets.as_matches(data), reference=table, degree=2))
+    assert check.state == "fail"
+    assert check.sentence.endswith("; too low a degree of the exposures may be the cause")
+    first = re.match(
+        r"--degree (\d) first, which the residuals call for \(see degree\); if the reference does not agree", check.cure
+    )
+    assert check_of(ld.solve(drawn_sets.as_matches(data), reference=table, degree=int(first[1]))).state == "unknown"
+
+
 def test_a_right_reference_passes_where_exposures_are_as_good():
     data, truth = dense_model.drawn_set(0, rolls=30.0, dynamic=0.002)
     table = made_catalogues.catalogue(truth["stars"], 0)

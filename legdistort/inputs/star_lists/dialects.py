@@ -72,7 +72,7 @@ def _photutils_flags(table):
 
 #: FlyStar and StarFinder; hst1pass (Anderson 2022, WFC3 ISR 2022-05), whose X, Y are x, y after the correction for
 #: charge transfer, u, v and U, V those without distortion; DAOPHOT of Stetson and of IRAF; photutils;
-#: the step source_catalog of the JWST pipeline, whose total flux is that of stars.
+#: the step source_catalog of the JWST pipeline, whose total flux is that of stars, its magnitudes where it has none.
 DIALECTS = (
     Dialect(
         "StarFinder, FlyStar",
@@ -107,6 +107,14 @@ DIALECTS = (
             ("xcentroid", "ycentroid", flux),
         )
         for flux in ("aper_total_flux", "isophotal_flux")
+    ),
+    *(
+        Dialect(
+            "the JWST pipeline",
+            {"x": ("xcentroid",), "y": ("ycentroid",), "mag": (f"{kind}mag",)},
+            ("xcentroid", "ycentroid", f"{kind}mag"),
+        )
+        for kind in ("aper_total_ab", "aper_total_vega", "isophotal_ab", "isophotal_vega")
     ),
     *(
         Dialect(

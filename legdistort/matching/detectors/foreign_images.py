@@ -5,6 +5,7 @@ The other detectors register such an exposure, and some of its detections lie ne
 
 import numpy as np
 
+from ...exceptions import AssumptionWarning, warn
 from ...geometry import similarity
 
 #: Of detections where others looked, less than this part of what is usual is of stars; from so many on; in words.
@@ -13,35 +14,43 @@ _PART, _ENOUGH = 0.25, 20
 _FEWEST = 5
 
 
-def foreign_images(camera, table, star, tied):
-    """Images of which hardly a detection is a star of other exposures, though these looked there.
+def without_foreign_images(camera, table, star, least):
+    """Numbers of the stars (n,), with a warning -1 for images of which hardly a detection is a star of the others.
+
+    Of those that lie where another exposure looked; of a detector of which nothing is used nothing is said.
 
     Parameters
     ----------
     camera : Camera
-        Of several detectors.
     table : QTable
         Detections (n,) in its focal plane, with their ``detector``.
     star : ndarray of int, shape (n,)
         Number of the star; negative for none.
-    tied : ndarray of bool, shape (n,)
-        Whether the star counts.
-
-    Returns
-    -------
-    dict
-        ``{(exposure, detector): (n_tied, n_seen)}``: of stars, and where another exposure looked.
+    least : int
+        Exposures that a star is in, to count.
     """
+    if len(camera.detectors) < 2:
+        return star
     ids, exposure = camera.ids(table), np.asarray(table["exposure"]).astype(str)
-    images = list(dict.fromkeys(zip(exposure.tolist(), ids.tolist(), strict=True)))
+    numbers, inverse, count = np.unique(star, return_inverse=True, return_counts=True)
+    tied = (numbers[inverse] >= 0) & (count[inverse] >= least)
+    used = np.unique(ids[tied]).tolist()
+    images = [each for each in dict.fromkeys(zip(exposure.tolist(), ids.tolist(), strict=True)) if each[1] in used]
     rows = {image: np.flatnonzero((exposure == image[0]) & (ids == image[1])) for image in images}
     shares = {image: tied[at].mean() for image, at in rows.items() if len(at) >= _ENOUGH}
     usual = np.median([*shares.values()]) if shares else 0.0
-    xy, out = np.stack([table["x"].value, table["y"].value], axis=1), {}
+    xy, out, told = np.stack([table["x"].value, table["y"].value], axis=1), star.copy(), []
     for image in (image for image, share in shares.items() if share < _PART * usual):
         seen = rows[image][_seen_by_others(camera, xy, exposure, star, tied & (ids != image[1]), rows[image], image[0])]
         if len(seen) >= _ENOUGH and (n := np.count_nonzero(tied[seen])) < _PART * usual * len(seen):
-            out[image] = n, len(seen)
+            out[rows[image]] = -1
+            told.append(f"{image[1]} of {image[0]} ({n} of {len(seen)})")
+    if told:
+        warn(
+            f"hardly a detection where other exposures looked is a star of theirs, of detector {', '.join(told)}: "
+            "nothing of it is used; is it the list of another field, exposure or detector?",
+            AssumptionWarning,
+        )
     return out
 
 

@@ -1,5 +1,6 @@
 """The check of a reference catalogue: do its stars agree with the exposures, is it bent, and would that have shown?"""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -22,8 +23,11 @@ _OFFSETS = (
 )
 #: Cures of the camera that residuals call for, and what is said of one before the others.
 _OF_DETECTORS = LAYOUT.cure, STATICS.cure
-_CALLED_FOR = "first, which the residuals call for (see camera); if the reference does not agree then"
+_CALLED_FOR = "first, which the residuals call for"
+_THEN = "if the reference does not agree then"
 _STATICS = "; else --static fit, which finds the distortions of single detectors"
+#: Checks whose cure may be a higher degree.
+_OF_DEGREE = "degree", "chi2", "brightness", "place"
 #: What to do about a plane that has not settled.
 _NEARER = (
     "a prior of the static distortion (--prior), from which the plane has less far to go, or more of its stars; else "
@@ -56,13 +60,33 @@ def reference_check(solution, camera=None):
     check = _in_words(solution, tie, label)
     if check.state in WRONG and camera is not None and camera.state in WRONG and camera.cure in _OF_DETECTORS:
         rest = check.cure.replace(_STATICS, "")
-        check = replace(check, cure=f"{camera.cure} {_CALLED_FOR}: {rest}")
+        check = replace(check, cure=f"{camera.cure} {_CALLED_FOR} (see camera); {_THEN}: {rest}")
     return replace(check, tests=tests)
 
 
 def is_told(check):
     """Whether the cure of a check begins with one of the camera that residuals call for."""
     return _CALLED_FOR in check.cure
+
+
+def degree_before_reference(checks):
+    """Checks of which that of a reference names the higher degree first that the residuals call for, if they do.
+
+    Exposures of too low a degree bend the stars against it as a bent reference does.
+    """
+    each = {check.name: check for check in checks}
+    check = each.get("reference")
+    if check is None or check.state not in WRONG or is_told(check):
+        return checks
+    wrong = [each[name] for name in _OF_DEGREE if name in each and each[name].state in WRONG]
+    found = [(c.name, m.group()) for c in wrong if (m := re.search(r"--degree \d+(?= would bring)", c.cure))]
+    if not found:
+        return checks
+    name, degree = found[0]
+    rest = re.sub(r"^see [\w ]+ first, which may be the cause; else ", "", check.cure)
+    sentence = f"{check.sentence}; too low a degree of the exposures may be the cause"
+    told = replace(check, sentence=sentence, cure=f"{degree} {_CALLED_FOR} (see {name}); {_THEN}: {rest}")
+    return tuple(told if c is check else c for c in checks)
 
 
 def absolute_by_reference(check, tie, error, known):

@@ -24,7 +24,7 @@ from .dynamic_check import EVIDENCE, dynamic_check, has_static_of_degree, mirror
 from .extrapolated_maps import extrapolation_check
 from .limits import MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
-from .reference_check import absolute_by_reference, is_told, reference_check
+from .reference_check import absolute_by_reference, degree_before_reference, is_told, reference_check
 from .residual_tests import Residuals
 from .star_checks import overlaps_check, rejection_check, stars_check, unfollowed
 
@@ -118,7 +118,8 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     if contradicted is not None:  # of residuals that it makes nothing else is told
         wrong = {check.name for check in made if check.state in WRONG} - {"camera"}
         return tuple(replace(c, cure="see camera first, which is the cause") if c.name in wrong else c for c in made)
-    return header_first(camera_first(_causes_first(made, explained), solution))
+    made = degree_before_reference(_causes_first(made, explained))
+    return header_first(camera_first(made, solution))
 
 
 def _by_residuals(solution, residuals, *, times):
