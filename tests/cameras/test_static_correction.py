@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 from astropy import units as u
-from astropy.io import fits
 from astropy.table import QTable, Table
+from ldac_files import write_ldac
 from numpy.polynomial import legendre
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -311,18 +311,9 @@ def test_a_list_of_one_of_several_detectors(folder, capsys, tmp_path):
 
 
 def ldac(path, **tables):
-    """As SExtractor writes it of a frame with extensions, counted from 1: before each table the header of the image."""
-    hdus = [fits.PrimaryHDU()]
-    for name, table in tables.items():
-        text = fits.Header({"NAXIS1": SHAPE[1], "NAXIS2": SHAPE[0], "EXTNAME": name}).tostring(padding=False)
-        cards = np.array([[text[k : k + 80] for k in range(0, len(text), 80)]], dtype="S80")
-        card = fits.Column("Field Header Card", f"{len(text)}A", array=cards, dim=f"(80, {len(text) // 80})")
-        hdus += [
-            fits.BinTableHDU.from_columns([card], name="LDAC_IMHEAD"),
-            fits.BinTableHDU(table, name="LDAC_OBJECTS"),
-        ]
-    fits.HDUList(hdus).writeto(path)
-    return path
+    """Of a frame with extensions, by their names."""
+    images = [{"EXTNAME": name} for name in tables]
+    return write_ldac(path, *tables.values(), size=SHAPE[::-1], images=images)
 
 
 def of_sextractor(xy, error):
