@@ -274,9 +274,9 @@ def _check_consistent(solution):
 
 
 def _check_residuals(solution):
-    """Raise if residuals do not follow from positions, poses and coefficients: of one detector, stars at rest."""
+    """Raise if residuals do not follow from positions, poses and coefficients: of one detector, these alone."""
     estimate, table = solution.estimate, solution.residuals[np.asarray(solution.residuals["used"])]
-    tables = estimate.displacement_tables or estimate.static_tables
+    tables = estimate.displacement_tables or estimate.static_tables or solution.diagnostics.terms
     if tables or estimate.motions is not None or solution.camera.has_focal_plane or not len(table):
         return
     found = {name: row for row, name in enumerate(solution.names)}

@@ -493,7 +493,9 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
 def _has_statics(fit):
     """Whether a fit has static distortions of the detectors of a camera, which `Joining` ties."""
     errors = fit.camera_errors
-    return fit.matches.camera.has_focal_plane and errors is not None and bool(errors.free[:, :, 3:].any())
+    if errors is None or not fit.matches.camera.has_focal_plane or fit.problem.terms.n:
+        return False
+    return bool(errors.free[:, :, 3:].any())
 
 
 def _identified(fit, reference, pixel_scale):

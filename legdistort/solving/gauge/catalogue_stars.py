@@ -58,10 +58,14 @@ class Joining:
         self.deviant, self.factor = (), 1.0
 
     def __call__(self, fit, statics):
-        """The fit joined, if `statics` of the detectors are sought or no star ties some of these; else as it is."""
+        """The fit joined, if `statics` of the detectors are sought or no star ties some of these; else as it is.
+
+        Statics where stars move are found without the reference: it is no prior on stars of precise visits that holds
+        the maps which these have apart.
+        """
         group = np.full(fit.problem.n_stars, -1)
         group[fit.problem.star[fit.used]] = fit.matches.camera.group_of(fit.matches.table[fit.problem.order][fit.used])
-        if group.max() < 1 and not statics:
+        if group.max() < 1 and not (statics and not fit.problem.terms.n):
             return fit
         terms, of = fit.problem.terms, fit.options
         epoch = terms.epoch if terms.n else fit.matches.epoch if self.epoch is None else self.epoch
