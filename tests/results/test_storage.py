@@ -428,6 +428,11 @@ def test_checksums_are_those_of_sha256(tmp_path):
     assert provenance.checksums(str(tmp_path / "a.fits")) == {"a.fits": known}
 
 
+def add_to(array, place, value):
+    """Of any kind of array: those of older asdf are no ndarray."""
+    array[place] = array[place] + value
+
+
 def saved_tree(solution, path):
     with asdf.open(solution.write(path, overwrite=True), lazy_load=False, memmap=False) as file:
         return file.tree["legdistort"]
@@ -451,7 +456,7 @@ def test_a_folded_solution_can_be_written(solution, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: np.add.at(t["exposures"]["coefficients"], (1, 0, 4), 1e-5), "of exposure exp01 do not follow"),
+        (lambda t: add_to(t["exposures"]["coefficients"], (1, 0, 4), 1e-5), "of exposure exp01 do not follow"),
         (lambda t: t["exposures"]["pose"].__setitem__((1, 0, 2), 3.0), "of exposure exp01 do not follow"),
         (lambda t: t["exposures"]["shape"].__setitem__((1, 1), 501), "of exposure exp01 do not follow"),
         (lambda t: t["stars"]["position"].__setitem__((0, 0), 7.0), "of exposure exp00 do not follow"),
