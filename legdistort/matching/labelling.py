@@ -70,8 +70,7 @@ class Labelled:
 
     def is_tied(self, least):
         """Which detections (n,) are of a star that so many are of."""
-        numbers, inverse, count = np.unique(self.star, return_inverse=True, return_counts=True)
-        return (numbers[inverse] >= 0) & (count[inverse] >= least)
+        return detector_places.is_tied(self.star, least)
 
     def n_tied(self, least):
         """Number of detections that are of a star that so many are of."""

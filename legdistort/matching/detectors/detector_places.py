@@ -54,6 +54,12 @@ def n_tied(star):
     return len(found) - len(np.unique(found))
 
 
+def is_tied(star, least):
+    """Which detections (n,) are of a star that so many are of."""
+    numbers, inverse, count = np.unique(star, return_inverse=True, return_counts=True)
+    return (numbers[inverse] >= 0) & (count[inverse] >= least)
+
+
 def farthest(moves, detector):
     """The detector that is moved most against the others, and by how much [pix], by moves (n, 2) of what was seen."""
     seen = np.unique(detector)

@@ -7,8 +7,9 @@ import numpy as np
 
 from ...exceptions import AssumptionWarning, warn
 from ...geometry import similarity
+from .detector_places import is_tied
 
-#: Of detections where others looked, less than this part of what is usual is of stars; from so many on; in words.
+#: Of detections where others looked, less than this part of what is usual is of stars; from so many on.
 _PART, _ENOUGH = 0.25, 20
 #: Fewest stars that tell how two exposures lie.
 _FEWEST = 5
@@ -31,20 +32,21 @@ def without_foreign_images(camera, table, star, least):
     """
     if len(camera.detectors) < 2:
         return star
-    ids, exposure = camera.ids(table), np.asarray(table["exposure"]).astype(str)
-    numbers, inverse, count = np.unique(star, return_inverse=True, return_counts=True)
-    tied = (numbers[inverse] >= 0) & (count[inverse] >= least)
-    used = np.unique(ids[tied]).tolist()
-    images = [each for each in dict.fromkeys(zip(exposure.tolist(), ids.tolist(), strict=True)) if each[1] in used]
-    rows = {image: np.flatnonzero((exposure == image[0]) & (ids == image[1])) for image in images}
-    shares = {image: tied[at].mean() for image, at in rows.items() if len(at) >= _ENOUGH}
-    usual = np.median([*shares.values()]) if shares else 0.0
+    ids, detector = np.unique(camera.ids(table), return_inverse=True)
+    names, exposure = np.unique(np.asarray(table["exposure"]).astype(str), return_inverse=True)
+    tied, image, n_images = is_tied(star, least), exposure * len(ids) + detector, len(names) * len(ids)
+    size, n_tied = np.bincount(image, minlength=n_images), np.bincount(image, tied, minlength=n_images)
+    used = np.bincount(detector, tied, minlength=len(ids)) > 0
+    counted = (size >= _ENOUGH) & np.tile(used, len(names))
+    shares = n_tied / np.maximum(size, 1)
+    usual = np.median(shares[counted]) if counted.any() else 0.0
     xy, out, told = np.stack([table["x"].value, table["y"].value], axis=1), star.copy(), []
-    for image in (image for image, share in shares.items() if share < _PART * usual):
-        seen = rows[image][_seen_by_others(camera, xy, exposure, star, tied & (ids != image[1]), rows[image], image[0])]
+    for number in np.flatnonzero(counted & (shares < _PART * usual)):
+        (i, c), rows = divmod(number, len(ids)), np.flatnonzero(image == number)
+        seen = rows[_seen_by_others(camera, xy, exposure, star, tied & (detector != c), rows)]
         if len(seen) >= _ENOUGH and (n := np.count_nonzero(tied[seen])) < _PART * usual * len(seen):
-            out[rows[image]] = -1
-            told.append(f"{image[1]} of {image[0]} ({n} of {len(seen)})")
+            out[rows] = -1
+            told.append(f"{ids[c]} of {names[i]} ({n} of {len(seen)})")
     if told:
         warn(
             f"hardly a detection where other exposures looked is a star of theirs, of detector {', '.join(told)}: "
@@ -54,12 +56,11 @@ def without_foreign_images(camera, table, star, least):
     return out
 
 
-def _seen_by_others(camera, xy, exposure, star, tied, rows, name):
+def _seen_by_others(camera, xy, exposure, star, tied, rows):
     """Which of an exposure's detections `rows` lie on a detector of another one, as stars on other detectors tell."""
-    out, mine = np.zeros(len(rows), dtype=bool), np.flatnonzero((exposure == name) & tied)
-    for other in dict.fromkeys(exposure.tolist()):
-        if other == name:
-            continue
+    own = exposure[rows[0]]
+    out, mine = np.zeros(len(rows), dtype=bool), np.flatnonzero((exposure == own) & tied)
+    for other in np.setdiff1d(exposure, own):
         theirs = np.flatnonzero((exposure == other) & tied)
         _, i, j = np.intersect1d(star[mine], star[theirs], return_indices=True)
         if len(i) >= _FEWEST:
